@@ -22,33 +22,24 @@ from mag_tracking.physics.bounds import ADVICE, MAX_SPEED, TOO_FAST
 
 MIN_CORRELATION = 0.97
 """Minimum fraction of the energy of one field that is explained by the other, delayed field."""
-
 MIN_PEAK = 0.7
 """Minimum height of a correlation maximum relative to the highest maximum."""
-
 N_COARSE, MAX_PAIRS = 512, 12
 """Number of samples in the search for correlation maxima, and of compared pairs (the closest)."""
-
 SCALE_STD, GAIN_STD, ROTATION_STD = 0.05, 0.02, np.deg2rad(2.0)
 """Prior standard deviations of the differences between the fields at two sensors: common scale
 (distance to the target), gain of each axis, and rotation [rad] about each axis."""
-
 MIN_DELAY = 3.0
 """Minimum delay in standard deviations; a smaller delay is not significant."""
-
 RELATIVE_KERNEL_WIDTH, MAX_DELAY_SHIFT = 0.3, 4.0
 """Width of the smoothing kernel relative to the RMS duration of the field, and maximum shift of a
 delay during the refinement in these widths."""
-
 MAX_PRIOR_CHI2 = 22.5
 """Maximum joint chi-square of rotation, scale and gains of equal fields (probability 0.001)."""
-
 MIN_DIFFERENCE_STDS, MIN_RELATIVE_DIFFERENCE = 3.0, 0.1
 """Minimum difference of contradicting speeds: in standard deviations, and relative to the speed."""
-
 MIN_COSINE = 0.3
 """Minimum cosine of the angle between the heading and the line through both sensors."""
-
 MIN_SAMPLES, MAX_READINGS = 10, 1_000_000
 """Minimum number of readings of each sensor, and maximum number of resampled readings of a pair."""
 
@@ -181,8 +172,7 @@ class _SensorReadings:
         from scipy.ndimage import gaussian_filter1d
 
         resampled = np.stack([np.interp(t, self.t, v) for v in self.field.T], axis=1)
-        smooth: FloatArray = gaussian_filter1d(resampled, width / (t[1] - t[0]), axis=0)
-        return smooth
+        return gaussian_filter1d(resampled, width / (t[1] - t[0]), axis=0)
 
 
 @dataclass(frozen=True)

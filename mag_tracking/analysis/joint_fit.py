@@ -12,17 +12,10 @@ from itertools import combinations
 
 import numpy as np
 
+from mag_tracking.analysis import pass_fit
 from mag_tracking.analysis.fitted_pass import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
 from mag_tracking.analysis.pass_description import PATH_TOLERANCE, assignment, fits_at_minimum
-from mag_tracking.analysis.pass_fit import (
-    COARSE_ERROR,
-    DEFAULT_ERRORS,
-    centred_on_peak,
-    shorter_rows,
-    starting_paths,
-    unusable_reason,
-)
 from mag_tracking.analysis.pass_result import MAX_COST_RATIO, PassFit
 from mag_tracking.analysis.pass_trust import has_plausible_residual
 from mag_tracking.arrays import BoolArray, FloatArray
@@ -34,28 +27,20 @@ from mag_tracking.units import NS
 N_REFINED, N_STEPS, N_CONVERGED, N_FINE_STARTS = 150, 6, 10, 2
 """Number of starting points that are refined in the coarse search, steps of each, number of coarse
 solutions that are refined until convergence, and of those from which the final fit starts."""
-
 INITIAL_LENGTH = 3.0
 """[m] Initial length of a row of dipoles that replaces a point."""
-
 MIN_GAP, VEHICLE_WIDTH = 3.0, 1.5
 """[m] Minimum distance between the rows of two vehicles, along and across their heading."""
-
 MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
-
 MAX_ROUNDS = 3
 """Maximum number of rounds of the order selection, each of all targets in turn."""
-
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
 """Maximum relative difference of velocity, and distance [m], of two fits, or of fit and track."""
-
 MAX_TARGETS = 3
 """Maximum number of targets in a joint fit, each with about twelve unknowns."""
-
 MAX_LENGTH = 18.75
 """[m] Maximum length of the iron of one vehicle: the limit for road trains (Directive 96/53/EC)."""
-
 MAX_VELOCITY_SPREAD = 0.25
 """Maximum relative difference of the velocity of a part of a vehicle from the mean of all parts."""
 
@@ -92,10 +77,10 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     zero of `data` and velocities [m/s].
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
-    orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
+    orders = [n for n in orders if not pass_fit.unusable_reason(data, n_targets * (n,))]
     if not orders:
         return ()
-    data, averaged = centred_on_peak(data)
+    data, averaged = pass_fit.centred_on_peak(data)
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
     fits = _JointFits(data, averaged, initial_paths, ground)
@@ -126,11 +111,11 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
         create_model, prior = partial(SuperposedPasses.from_orders, orders), ground.prior(orders)
         starts = [np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts])
                   for known_path, target_starts in zip(
-                      paths, (starting_paths(r, 1) for r in residuals), strict=True)]
+                      paths, (pass_fit.starting_paths(r, 1) for r in residuals), strict=True)]
         coarse = separable_problem(averaged, create_model, prior=prior)
-        paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
-                                 coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
-                                 N_REFINED, N_STEPS, N_CONVERGED)
+        smooth = separable_problem(averaged, create_model, pass_fit.COARSE_ERROR, prior)
+        paths, _ = coarse_minima(smooth, coarse, np.concatenate(starts), np.tile(
+            PATH_TOLERANCE[:6], n), N_REFINED, N_STEPS, N_CONVERGED)
         if n < n_targets:
             model = create_model(averaged.t, averaged.positions,
                                  averaged.network.R_sw[averaged.sensor])
@@ -175,7 +160,7 @@ class _JointFits:
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
             paths = _with_orders([fit.x[:6 + (fit.n_dipoles > 1)] for fit in previous], orders)
-            rows = [paths[k], *(shorter_rows(paths[k]) if orders[k] > 1 else ())]
+            rows = [paths[k], *(pass_fit.shorter_rows(paths[k]) if orders[k] > 1 else ())]
             starts += [[*paths[:k], row, *paths[k + 1:]] for row in rows]
         return np.array([np.concatenate(paths) for paths in starts])
 
@@ -203,7 +188,7 @@ class _JointFits:
             minimum.theta, fine.linear(minimum.theta))
         unexplained = max(minimum.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
         return fits_at_minimum(data, orders, replace(minimum, theta=theta), p, 1.0 - unexplained,
-                               DEFAULT_ERRORS, path_std=prior[1])
+                               pass_fit.DEFAULT_ERRORS, path_std=prior[1])
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
@@ -263,8 +248,7 @@ def _finished(fits: Sequence[PassFit], best: int,
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
-    """Whether position and velocity of a fit agree at the strongest field with a path (6 or more,)
-    of the same time zero."""
+    """Whether a fit agrees at its strongest field with a path (6 or more,), same time zero."""
     if not len(fit.x):
         return False
     seconds = _fitted_peak_s(fit)

@@ -13,8 +13,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 
 ModelFactory: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
-"""Function that creates a model from times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3)
-that multiply the field."""
+"""Creates a model from times (n,) [s], positions (n, 3) [m] and factors (n, 3, 3) of the field."""
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,9 @@ from itertools import permutations
 
 import numpy as np
 
+from mag_tracking.analysis import pass_trust
 from mag_tracking.analysis.pass_data import PassData, background_columns
 from mag_tracking.analysis.pass_result import PassFit, bearing_of, scaled_to_range
-from mag_tracking.analysis.pass_trust import (
-    FittedRow,
-    reach,
-    rejection_reason,
-    residual_elsewhere,
-    trusted_quantities,
-)
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import cross_matrix
 from mag_tracking.inference.crlb import bound, cpa_information, information
@@ -24,10 +18,8 @@ from mag_tracking.physics.passes import SuperposedPasses
 MIDDLE_FRACTION, MIN_MIDDLE_STD, MIDDLE_ACROSS_STD = 0.15, 0.4, 0.1
 """Standard deviation of the distance from the centre of the row to the middle of the vehicle: along
 the vehicle relative to the length of the row, and at least [m]; across it and vertically [m]."""
-
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
 """Maximum difference between equal paths: position [m], velocity [m/s] and length [m]."""
-
 CPA_UNIT_STD = 1e-4
 """[m] Standard deviation of an assumed CPA range. Such a range only defines the unit of length."""
 
@@ -66,12 +58,11 @@ def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArra
         P = np.zeros((6, 6))
         P[:3, :3], P[3:, 3:] = rotation_covariance, errors.gain_std**2 * np.eye(3)
         sensor_error += shift @ P @ shift.T
-    robust: FloatArray = covariance + model_error + sensor_error
-    return robust
+    return covariance + model_error + sensor_error
 
 
 def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArray,
-                     position_index: int, row: FittedRow) -> FloatArray:
+                     position_index: int, row: pass_trust.FittedRow) -> FloatArray:
     """Covariance (3, 3) [m², world frame] of the middle of a vehicle about the centre of its row.
 
     The field of iron that extends by `reach` beyond the dipoles resembles that of dipoles at
@@ -87,14 +78,13 @@ def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArra
     along = np.clip(offset @ forward, -0.5 * length, 0.5 * length)
     offset = offset - along[:, None] * forward
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
-    extent = reach(n_dipoles, length)
+    extent = pass_trust.reach(n_dipoles, length)
     apparent = extent**2 * offset / np.maximum(distance, extent)**2
     field_error = np.einsum('nai,ni->na', whitened[:, :, xyz], apparent)
     shift = covariance[xyz] @ np.einsum('nax,na->x', whitened, field_error)
     along_variance = max(MIN_MIDDLE_STD, MIDDLE_FRACTION * length)**2
-    total: FloatArray = np.outer(shift, shift) + MIDDLE_ACROSS_STD**2 * np.eye(3) \
+    return np.outer(shift, shift) + MIDDLE_ACROSS_STD**2 * np.eye(3) \
         + (along_variance - MIDDLE_ACROSS_STD**2) * np.outer(forward, forward)
-    return total
 
 
 def _split_by_sensor(data: PassData, whitened: FloatArray, residuals: FloatArray) -> tuple[
@@ -153,8 +143,7 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], minimum: Minimum, p: 
         rivals.append(([paths[i] for i in assignment(fitted_paths, paths)], cost))
     fits = [replace(fit, rivals=_select_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
             for k, fit in enumerate(fits)]
-    return tuple(replace(fit, reason=rejection_reason(fit), trusted=trusted_quantities(fit))
-                 for fit in fits)
+    return tuple(map(_judged, fits))
 
 
 def _fit_of_one_sensor(data: PassData, n_dipoles: int, minimum: Minimum, p: FloatArray,
@@ -179,7 +168,13 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, minimum: Minimum, p: Floa
     fit = replace(fit, rivals=((0.0, mirrored),))
     if cpa_range is None:
         fit = replace(fit, bearing=bearing_of(fit, position))
-    return replace(fit, reason=rejection_reason(fit), trusted=trusted_quantities(fit))
+    return _judged(fit)
+
+
+def _judged(fit: PassFit) -> PassFit:
+    """Add the reason for a rejection and the trusted quantities to a fit."""
+    return replace(fit, reason=pass_trust.rejection_reason(fit),
+                   trusted=pass_trust.trusted_quantities(fit))
 
 
 class _LinearisedFit:
@@ -208,7 +203,7 @@ class _LinearisedFit:
         D, A, W = model.derivative(theta[None], p[None])[0], model.basis(theta[None])[0], \
             data.whitening
         fields = np.stack([(A[:, m] @ p[m]).reshape(-1, 3) for _, m in slices])
-        self.data, self.rows = data, [FittedRow(*row) for row in zip(
+        self.data, self.rows = data, [pass_trust.FittedRow(*row) for row in zip(
             orders, model.split(theta), fields, strict=True)]
         y = np.nan_to_num(data.field) - fields.sum(axis=0)
         backgrounds = np.asarray(np.linalg.lstsq(
@@ -248,7 +243,7 @@ def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, er
                   for row, indices in targets]
         predicted_std = np.sqrt(np.einsum('yi,ij,yj->y', H, robust, H)).reshape(-1, 3)
         covariance, robust = (T @ P @ T.T for P in (covariance, robust))
-    unexplained = residual_elsewhere(data, rows, linear.residuals)
+    unexplained = pass_trust.residual_elsewhere(data, rows, linear.residuals)
     fits = []
     for (row, indices), shape in zip(targets, shapes, strict=True):
         target_data = replace(data, field=data.field - (total_field - row.field))

@@ -16,13 +16,10 @@ from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
 """Number of averaged samples per sensor in the coarse search."""
-
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the coarse search; it smooths the cost function."""
-
 FALSE_ALARM_PROBABILITY = 1e-6
 """False alarm probability of the energy threshold of a pass."""
-
 DEFAULT_ERRORS = SensorErrors()
 """Errors of uncalibrated sensors that were mounted by hand."""
 
@@ -34,12 +31,9 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
 
     A row of one dipole is a point target without a length. `cpa_range` is a known CPA range and its
     std [m], only for a single sensor, for which the scale is not observable (TSP14 section IV.B).
-    Raises ValueError with several sensors, or without a dipole. Time zero is at the strongest
-    field. `errors` are included in the robust covariance. TSP14 sections III.A and V; T10 Alg. 1.
+    Time zero is at the strongest field. `errors` are included in the robust covariance. TSP14
+    sections III.A and V; T10 Alg. 1.
     """
-    if cpa_range is not None and len(data.sensors) > 1:
-        raise ValueError('cpa_range requires data of a single sensor, got '
-                         f'{len(data.sensors)} sensors')
     reason = unusable_reason(data, (n_dipoles,))
     if reason:
         return PassFit(n_dipoles, data, reason)
@@ -73,8 +67,6 @@ def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
 
 def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
     """Reason why there are too few measurements for a fit; empty if there are enough."""
-    if min(orders) < 1:
-        raise ValueError(f'number of dipoles is {min(orders)}; at least one dipole is required')
     if not len(data.sensors):
         return 'no sensor has a measurement'
     axes = sum(int((~np.isnan(data.field[data.sensor == j])).any(axis=0).sum())

@@ -11,22 +11,16 @@ from mag_tracking.physics.passes import closest_approach
 
 RIVAL_CHI2 = 9.2
 """Maximum chi-square difference between a rival and the best fit (probability 0.01)."""
-
 DIFFERENT_PATH_CHI2 = 22.5
 """Minimum squared normalised distance of different paths in six parameters (probability 0.001)."""
-
 MAX_NORMALISED_COST = 2.0
 """Maximum normalised cost of a joint fit that is not dominated by model errors."""
-
 MAX_COST_RATIO = 1.25
 """Maximum cost relative to the best cost; fits up to this ratio count as equally good."""
-
 MIN_LENGTH_FRACTION = 1e-2
 """Minimum length of a row, at most one, relative to the distance travelled during the pass."""
-
 MIN_CPA_FRACTION = 1e-3
 """Minimum CPA range of a path beside the sensor, relative to the distance travelled."""
-
 MAX_DIRECTION_STD = 0.5
 """[rad] Maximum standard deviation of a direction. Less certain directions are set to NaN."""
 

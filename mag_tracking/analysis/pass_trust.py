@@ -19,25 +19,19 @@ POINT_REACH = 2.1
 the field is the reach over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51
 (T10 Table 6.1, TSP14 Table I), with 87 times the noise energy per value on average over the
 pass."""
-
 ROW_REACH, MIN_ROW_REACH = 0.45, 0.4
 """Reach of the iron from a row, relative to the spacing of its dipoles, and at least [m], from the
 costs of cars and trucks with three dipoles in T10 Table 6.5 and TSP14 Table II."""
-
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
-
 MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE = 0.003, 0.1
 """Maximum unexplained energy outside the reach of a vehicle, the larger limit applies: fraction of
 the field energy (gain errors, a swerve), and fraction of the total residual."""
-
 MIN_PASS_DISTANCE = 0.3
 """Minimum distance travelled during a pass, relative to the distance of the nearest sensor."""
-
 MAX_VELOCITY_CHANGE, MIN_VELOCITY_CHANGE_STDS = 0.3, 2.5
 """Maximum relative change of the velocity (a turn of 17 degrees; model errors of vehicles cause up
 to 0.2), and minimum significant change in standard deviations."""
-
 MAX_SPEED_STD, MAX_HEADING_STD, MAX_TIME_STD = 0.25, np.pi / 6.0, 0.25
 """Maximum standard deviation of a trusted speed relative to the speed, of a direction [rad], and of
 a CPA time relative to the distance of the nearest sensor over the speed."""

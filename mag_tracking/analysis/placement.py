@@ -17,10 +17,8 @@ from mag_tracking.physics.dipole import sensor_fields
 DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], *(
     np.array(d) / np.sqrt(3.0) for d in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))])
 """(7, 3) directions of the moment. Opposite directions result in the same information."""
-
 STATES = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz')
 """Names of the states [r, v, m]."""
-
 MAX_FIELDS = 200_000
 """Maximum number of fields computed at once, to limit memory."""
 

@@ -8,16 +8,12 @@ from mag_tracking.arrays import FloatArray
 
 N_SAMPLES, MIN_SAMPLES = 64, 8
 """Number of samples of a resampled signature, and minimum number of a recorded one."""
-
 BASELINE_FRACTION, TAIL_FRACTION = 0.1, 0.005
 """Fraction of a signature, at each end, for the baseline, and of its energy that is cut off."""
-
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""
-
 AUTOCORRELATION_LAGS = (2, 4, 8, 16)
 """Lags of the autocorrelation of the field magnitude, in samples."""
-
 N_DCT_COEFFICIENTS = 8
 """Number of coefficients of the discrete cosine transform of the field magnitude."""
 
@@ -73,8 +69,7 @@ def features(signature: Signature) -> FloatArray:
 
 
 def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Subtract the line through both ends of a signature, cut off its tails and resample the rest
-    to (N_SAMPLES, n_axes)."""
+    """Subtract the line through both ends, cut off the tails, resample to (N_SAMPLES, n_axes)."""
     n = max(2, round(BASELINE_FRACTION * len(t)))
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)
@@ -90,9 +85,8 @@ def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
     width = max(1, round((sample_indices[-1] - sample_indices[0]) / N_SAMPLES))
     smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine_field.T],
                       axis=1)
-    out: FloatArray = np.stack([np.interp(sample_indices, np.arange(len(even_times)), axis)
-                                for axis in smooth.T], axis=1)
-    return out
+    return np.stack([np.interp(sample_indices, np.arange(len(even_times)), axis)
+                     for axis in smooth.T], axis=1)
 
 
 def _axis_features(axis: FloatArray, energy_fraction: float, max_magnitude: float) -> list[float]:

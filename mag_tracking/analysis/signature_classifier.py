@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from mag_tracking.analysis.signature import Signature, features
 from mag_tracking.arrays import FloatArray, IntArray
@@ -18,15 +19,12 @@ VERSION = 1
 """Version of the model file format."""
 MIN_SAMPLES = 4
 """Minimum number of training examples of a class."""
-
 N_FOLDS, TEST_FRACTION = 5, 0.3
 """Number of folds of the cross-validation, and fraction of a class in the test part of a split."""
 PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate values of C, the inverse regularisation strength of the logistic regression."""
-
 KNOWN_QUANTILE = 0.99
 """Quantile of the distances of held-out examples to their class, beyond which it is `unknown`."""
-
 TEMPERATURES = np.geomspace(0.3, 10.0, 40)
 """Candidate temperatures of the logits."""
 
@@ -43,13 +41,11 @@ class SignatureModel:
     method: str
     """Name of the selected training method."""
     mean: FloatArray
-    """(n_features,) mean features of the training set."""
     scale: FloatArray
-    """(n_features,) standard deviations of these features."""
+    """(n_features,) means and standard deviations of the features of the training set."""
     weights: FloatArray
-    """(n_classes, n_features) weights of the scaled features."""
     offsets: FloatArray
-    """(n_classes,) offsets of the logits."""
+    """Weights (n_classes, n_features) of scaled features, offsets (n_classes,) of the logits."""
     temperature: float
     """Divisor of the logits. It corrects overconfidence due to a small training set."""
     centres: FloatArray
@@ -64,19 +60,15 @@ class SignatureModel:
     def posterior(self, x: FloatArray) -> FloatArray:
         """Posterior probabilities (n, n_classes) for features `x` (n, n_features)."""
         z = (x - self.mean) / self.scale
-        return _softmax((z @ self.weights.T + self.offsets) / self.temperature)
-
-    def is_known(self, x: FloatArray) -> FloatArray:
-        """Whether each signature is within `limit` of the nearest class centre."""
-        known: FloatArray = _squared_distances((x - self.mean) / self.scale, self.centres,
-                                               self.precision).min(axis=1) <= self.limit
-        return known
+        logits = (z @ self.weights.T + self.offsets) / self.temperature
+        return np.asarray(softmax(logits, axis=1))
 
     def names(self, x: FloatArray) -> list[str]:
-        """Most probable class of each signature, or `unknown`."""
+        """Most probable class of each signature, or `unknown` beyond `limit` of all classes."""
         best = self.posterior(x).argmax(axis=1)
-        return [self.classes[k] if known else UNKNOWN
-                for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
+        distances = _squared_distances((x - self.mean) / self.scale, self.centres, self.precision)
+        return [self.classes[k] if distance <= self.limit else UNKNOWN for k, distance in zip(
+            best.tolist(), distances.min(axis=1).tolist(), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -139,8 +131,9 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
             weights, offsets = _weights_and_offsets(
                 create_estimator().fit(z[train_rows], y[train_rows]), len(classes))
             held_out_logits[test_rows] = z[test_rows] @ weights.T + offsets
-        losses = [float(-np.mean(np.log(np.maximum(
-            _softmax(held_out_logits / t)[np.arange(len(y)), y], 1e-300)))) for t in TEMPERATURES]
+        probabilities = (softmax(held_out_logits / t, axis=1)[np.arange(len(y)), y]
+                         for t in TEMPERATURES)
+        losses = [float(-np.mean(np.log(np.maximum(p, 1e-300)))) for p in probabilities]
         k = int(np.argmin(losses))
         candidates.append((losses[k], name, create_estimator, float(TEMPERATURES[k])))
     _, name, create_estimator, temperature = min(candidates, key=lambda s: s[0])
@@ -291,10 +284,3 @@ def _squared_distances(z: FloatArray, centres: FloatArray, precision: FloatArray
     e = z[:, None] - centres
     distances: FloatArray = np.einsum('nci,ij,ncj->nc', e, precision, e)
     return distances
-
-
-def _softmax(logits: FloatArray) -> FloatArray:
-    """Convert logits to probabilities (n, n_classes)."""
-    p = np.exp(logits - logits.max(axis=1, keepdims=True))
-    out: FloatArray = p / p.sum(axis=1, keepdims=True)
-    return out

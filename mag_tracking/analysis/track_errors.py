@@ -1,4 +1,4 @@
-"""Errors of tracks with respect to the truth, and consistency of their covariances."""
+"""Errors of tracks with respect to the truth, relative to their covariances and to the bound."""
 
 from collections.abc import Iterable
 from typing import TypeAlias, TypedDict
@@ -9,6 +9,10 @@ from numpy.typing import ArrayLike
 from mag_tracking.analysis.track_log import PoseLog, TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import rotation_from_quaternion
+from mag_tracking.inference.crlb import path_bound
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.dipole import sensor_fields
+from mag_tracking.physics.sources import constant_velocity, integrator_noise
 
 Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 """Timestamps (n,) [ns], positions (n, 3) [m] and quaternions (n, 4) xyzw of a target; quaternions
@@ -18,35 +22,28 @@ NEAR_M = 5.0
 
 
 class PassErrors(TypedDict):
-    """Errors of a vehicle's track, as returned by `pass_errors`."""
+    """Horizontal errors of the `n` poses of a vehicle whose true position is within `NEAR_M`."""
 
     rms: float | None
-    """Horizontal RMS error of the poses within `NEAR_M` [m]; None if there are no such poses."""
+    """RMS error of these poses [m]; None if there are none."""
     closest: float
-    """Horizontal error of the pose whose true position is closest to the centre [m]."""
     closest_distance: float
-    """Horizontal distance of this true position from the centre [m]."""
+    """Error of the pose whose true position is closest to the centre, and its distance [m]."""
     anees: float
-    """Mean NEES per axis of the poses within `NEAR_M`, or of the closest pose if no pose is
-    within `NEAR_M`."""
+    """Mean NEES per axis of these poses, or of the closest pose if there are none."""
     n: int
-    """Number of poses whose true position is within `NEAR_M`."""
 
 
 class MagnetErrors(TypedDict):
-    """Errors of a magnet's track, as returned by `magnet_errors`."""
+    """Position errors [m] of the `n` evaluated poses of a magnet."""
 
     position_mean: float
-    """Mean position error [m]."""
     position_max: float
-    """Maximum position error [m]."""
     axis_median_deg: float | None
-    """Median angle between the estimated and the true axis [deg]; None if the truth has no
-    orientations."""
+    """Median angle between the estimated and the true axis; None for a truth without it."""
     anees: float
     """Mean NEES per axis of the position."""
     n: int
-    """Number of evaluated poses."""
 
 
 def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
@@ -79,19 +76,15 @@ def pass_errors(log: PoseLog, truth: Truth, centre: FloatArray) -> PassErrors | 
 
 
 class UnflaggedPoses(TypedDict):
-    """Counts of poses that are not flagged as ambiguous, as returned by `unflagged_poses`."""
+    """Counts of poses without the ambiguous flag: with a truth, wrong ones, without a truth."""
 
     n: int
-    """Number of unflagged poses at times for which a true position is available."""
     wrong: int
-    """Number of wrong poses among these poses."""
     without_truth: int
-    """Number of unflagged poses at times for which no true position is available."""
 
 
 WRONG_M, WRONG_STD = 2.0, 3.0
-"""A pose is wrong if its horizontal error exceeds both this distance [m] and this number of
-standard deviations in the direction of the error."""
+"""A pose is wrong if its horizontal error exceeds this distance [m], and these stds along it."""
 
 
 def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:
@@ -165,3 +158,71 @@ def magnet_errors(log: PoseLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
     return {'position_mean': float(magnitude.mean()), 'position_max': float(magnitude.max()),
             'axis_median_deg': float(np.median(angle)) if len(angle) else None,
             'anees': float(nees.mean()), 'n': len(stamps)}
+
+
+MIN_VELOCITY_STD = 1e-9
+"""[m/s] Minimum standard deviation of the velocity prior, for targets at rest."""
+
+
+def error_over_bound(network: SensorNetwork, log: TrackLog,
+                     truth: Truth, acceleration: FloatArray,
+                     moment_walk: float, field_error: float, background_std: float,
+                     rows: IntArray, axes: int) -> float | None:
+    """Ratio of the RMS error of a track to the posterior Cramér-Rao bound along the true path.
+
+    The bound applies to a point target with the estimated moment, because the true one is unknown,
+    and the tracker's motion model, sensor noise and relative field error; the backgrounds are
+    states. None if fewer than two poses have a ground truth, or none of the evaluated `rows` of the
+    log. T10 Alg. 2, linearised at the truth; [Tichavsky98]_. `truth` is timestamps [ns], positions
+    [m] and quaternions (xyzw); `acceleration` (3,) its spectral density [m²/s³]; `moment_walk` the
+    relative random walk of the moment [1/s^0.5]; `background_std` in T is that of the prior; `axes`
+    is 2 for the horizontal error, 3 for the error in space.
+    """
+    true_path = interpolate_truth(truth, log.stamp_ns)
+    truth_rows = np.flatnonzero(np.isfinite(true_path).all(axis=1))
+    if axes == 2:
+        # The ground truth contains the height of the road, not of the magnetic centre.
+        true_path[:, 2] = np.array(log.position)[:, 2]
+    rows = np.intersect1d(rows, truth_rows)
+    if len(truth_rows) < 2 or not len(rows):
+        return None
+    t = log.seconds()[truth_rows]
+    H, C = _measurement_model(network, log, true_path[truth_rows], truth_rows, field_error)
+    n_x, moments = H.shape[-1], np.array(log.moment)[truth_rows]
+    F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
+    for k, dt in enumerate(np.diff(t), 1):
+        F[k, :6, :6] = constant_velocity(dt)
+        Q[k, :6, :6] = integrator_noise(dt, acceleration)
+        Q[k, 6:9, 6:9] = moment_walk**2 * dt * np.square(moments[k]).sum() * np.eye(3)
+    # The prior has the extent and speed of the path as standard deviations.
+    steps = np.linalg.norm(np.diff(true_path[truth_rows], axis=0), axis=1)
+    std = np.full(n_x, background_std)
+    std[:3] = max(np.ptp(true_path[truth_rows], axis=0).max(),
+                  np.ptp(network.positions, axis=0).max())
+    std[3:6] = max(steps.max() / np.diff(t).min(), MIN_VELOCITY_STD)
+    std[6:9] = np.linalg.norm(moments[0])
+    P = path_bound(F, Q, H, C, np.diag(std**2))
+    is_evaluated = np.isin(truth_rows, rows)
+    variance = np.einsum('kii->ki', P[is_evaluated])[:, :axes].sum(axis=1)
+    error = np.array(log.position)[truth_rows[is_evaluated]] - true_path[truth_rows[is_evaluated]]
+    return float(np.sqrt(np.mean(np.square(error[:, :axes]).sum(axis=1)) / np.mean(variance)))
+
+
+def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray,
+                       truth_rows: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
+    """Jacobians (k, n_sensors, 3, n_x) of the field with respect to [r, v, m, backgrounds], NaN
+    without a measurement, and noise covariances (k, n_sensors, 3, 3)."""
+    n, n_sensors = len(truth_rows), len(network)
+    dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
+    dr_dx[:, 0, range(3), range(3)] = 1.0
+    dm_dx[:, 0, range(3), range(6, 9)] = 1.0
+    moment = np.array(log.moment)[truth_rows]
+    h, H, _ = sensor_fields(network.positions, network.R_sw, true_path[:, None].copy(),
+                            moment[:, None].copy(), dr_dx, dm_dx)
+    backgrounds = np.eye(3 * n_sensors).reshape(n_sensors, 3, -1)
+    H = np.concatenate([H, np.broadcast_to(backgrounds, (n, *backgrounds.shape))], axis=-1)
+    measured = ~np.isnan(np.array(log.measured)[truth_rows])
+    H = np.where(measured[..., None], H, np.nan)
+    C = np.array(log.noise)[truth_rows] + field_error**2 * np.square(h).sum(axis=-1)[
+        ..., None, None] * np.eye(3)
+    return H, C

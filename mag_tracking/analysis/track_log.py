@@ -40,8 +40,7 @@ class SmoothedLog(PoseLog):
             getattr(self, name).append(getattr(pose, name))
 
     def summary(self) -> dict[str, float]:
-        """Horizontal speed, moment and std of the horizontal position, at the most certain
-        position."""
+        """Horizontal speed, moment and std of the position, where the position is most certain."""
         best = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
         return {'speed': float(np.hypot(*self.velocity[best][:2])),
                 'moment_size': float(np.linalg.norm(self.moment[best])),

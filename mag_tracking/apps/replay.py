@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.analysis.correlated_motion import contradicts_delays, correlated_motion
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.track_errors import (
     MAGNET_SKIP,
     Truth,
+    error_over_bound,
     interpolate_truth,
     magnet_errors,
     near_poses,

@@ -22,30 +22,22 @@ COMPASS_BIAS_STD = 6e-7
 
 FALSE_ALARM_PROBABILITY = 1e-5
 """Probability that a correct sensor is reported."""
-
 OFFSET_PROBABILITY = 1e-3
 """Probability that a sensor with a constant offset is regarded as misleading."""
-
 EXPLAINED_PROBABILITY = 0.05
 """Probability of a larger remaining difference above which a fault is preferred to an offset."""
-
 GAIN_STDS = 2.0
 """Half of the stated interval of a gain, in standard deviations."""
-
 MIN_GAIN_ERROR, MAX_AXIS_GAIN, MAX_GAIN = 0.1, 10.0, 2e4
 """A gain is an explanation if it differs from 1 by more than the first value, and it or its inverse
 is below the second value for one axis, and below the third for all axes."""
-
 UNIT_TOLERANCE = 0.1
 """A gain that differs from a power of ten by less than this may be due to a wrong unit."""
-
 MAX_HEADING_STDS, YAW_STEP = 5.0, np.deg2rad(0.25)
 """Maximum tested heading error in standard deviations, and step of the tested headings [rad]."""
-
 MAX_REMAINING_FRACTION, MAX_RATIO_TO_NEXT = 0.3, 0.5
 """Maximum difference that remains after a partial explanation, relative to the original one, and to
 that after the next best, equally complex change of axes."""
-
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
 

@@ -10,7 +10,6 @@ covariance of a target-free interval; the line and the freezing are additions of
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from math import inf
 from typing import NamedTuple
 
@@ -41,7 +40,7 @@ from mag_tracking.calibration.frequent_level import (
     MostFrequentLevel,
     ProvisionalLevel,
 )
-from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
+from mag_tracking.calibration.level_change import ChangeEvaluator
 from mag_tracking.calibration.sensor_state import corrected_steps
 from mag_tracking.units import NS
 
@@ -57,9 +56,8 @@ class RelearntBackground(NamedTuple):
     has_departed: bool
     """Whether a target in the background has departed, or else another level lasted or returned."""
     before: FloatArray
-    """Previous background, (3,) T, sensor frame. NaN for a missing axis."""
     after: FloatArray
-    """New background, (3,) T, sensor frame. NaN for a missing axis."""
+    """Previous and new background, (3,) T, sensor frame. NaN for a missing axis."""
 
 
 class RunningBackground(BackgroundLevel):
@@ -92,7 +90,7 @@ class RunningBackground(BackgroundLevel):
     def __init__(self, learn: float, memory: float, guard: float, block: float,
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
-                 sensors: StructArray, evaluate_change: ChangeEvaluator | None = None) -> None:
+                 sensors: StructArray, evaluate_change: ChangeEvaluator) -> None:
         self._learn, self._block_length, self._relearn = learn, block, relearn
         super().__init__(sensors, freeze_std)
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
@@ -109,9 +107,7 @@ class RunningBackground(BackgroundLevel):
         self._departure_level: FloatArray = np.full(3, np.nan)
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
-        self._departure = LevelDeparture(
-            learn, relearn, sensors, self,
-            evaluate_change or partial(SharedChanges().evaluate_change, 0))
+        self._departure = LevelDeparture(learn, relearn, sensors, self, evaluate_change)
         self.forget()
 
     def forget(self) -> None:
@@ -153,7 +149,11 @@ class RunningBackground(BackgroundLevel):
         Unlike after `resume`, another level must last for the full `relearn` time to replace it. No
         effect if the noise of all axes is unknown.
         """
-        covariance = self.without_unknown_noise(covariance)
+        # The noise of a constant axis is unknown if its steps are, or are too fine to observe.
+        steps = corrected_steps(self._sensors)
+        is_unknown = (covariance.diagonal() <= core.MIN_STD**2) & ~(
+            np.isfinite(steps) & (steps > 0.0))
+        covariance = np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
         if not np.isnan(covariance).all():
             self.resume(level, covariance)
             self._relearns_soon = False
@@ -176,7 +176,10 @@ class RunningBackground(BackgroundLevel):
     @property
     def scatter_std(self) -> FloatArray:
         """Standard deviation (3,) T of quiet readings, with quantisation; NaN if unknown."""
-        variance = self._quiet.scatter() + self._state['step_variance']
+        covariance = pooled_covariance(self._quiet.blocks()) if self._quiet else None
+        if covariance is None:
+            return np.full(3, np.nan)
+        variance = covariance.diagonal() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
     @property

@@ -18,22 +18,16 @@ from mag_tracking.units import NS
 
 TYPICAL_DRIFT, STEEP_DRIFT = 3e-9, 1e-8
 """[T/s] Typical and maximum drift of a background; the latter while a sensor is warming up."""
-
 MIN_SLOPE_STDS = 4.0
 """Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
-
 MAX_AGE_S, MAX_DRIFT = 600.0, 4.0
 """Maximum age [s] of a former level, and its maximum drift in tolerances of a block mean."""
-
 MIN_RELEARN_S = 10.0
 """[s] Minimum duration of another steady level that replaces a resumed or short background."""
-
 SHORTENED_FRACTION = 2.0 / 3.0
 """Required duration of a former level, or of that after a departure, relative to the usual one."""
-
 MAX_EVALUATED_BLOCKS = 240
 """Maximum number of blocks (a minute of the usual length) of an evaluated arrival or departure."""
-
 Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which it is constant."""
 
@@ -89,13 +83,6 @@ class BackgroundLevel:
         is_dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= core.MIN_STD**2)
         return np.where(is_dead[:, None] | is_dead, np.nan, noise)
 
-    def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
-        """Covariance with NaN for constant axes whose steps are unknown or too fine to observe."""
-        steps = corrected_steps(self._sensors)
-        is_unknown = (covariance.diagonal() <= core.MIN_STD**2) & ~(
-            np.isfinite(steps) & (steps > 0.0))
-        return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
-
     @property
     def covariance(self) -> FloatArray | None:
         """Noise (3, 3) T² of one sample with quantisation; None if unknown, NaN if unreported."""
@@ -117,8 +104,7 @@ class BackgroundLevel:
         """Background (k, 3) T at times (k,) in s; it must be ready."""
         assert self.line is not None
         centre, mean, slope, horizon = self.line
-        out: FloatArray = mean + (np.minimum(times, horizon) - centre)[:, None] * slope
-        return out
+        return mean + (np.minimum(times, horizon) - centre)[:, None] * slope
 
     def difference(self, time: float, field: FloatArray) -> FloatArray:
         """Field (3,) T minus the background; raises ValueError if the background is not ready."""

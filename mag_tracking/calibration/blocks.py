@@ -112,11 +112,6 @@ class QuietInterval:
         """Blocks of the interval, in no particular order."""
         return Blocks(*(values[:len(self)] for values in self._window))
 
-    def scatter(self) -> FloatArray:
-        """Pooled variance (3,) T² of the readings within the blocks; NaN if unknown."""
-        covariance = pooled_covariance(self.blocks()) if self else None
-        return np.full(3, np.nan) if covariance is None else covariance.diagonal()
-
 
 class LearningWindow:
     """Window of the latest blocks, which provides candidates for the first quiet interval.

@@ -12,37 +12,26 @@ from mag_tracking.arrays import BoolArray, FloatArray
 
 KNOCK_THRESHOLD = 10.0
 """Minimum magnitude of a knock in standard deviations of the signal at rest."""
-
 MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
-
 MAX_RIVAL_RATIO = 0.9
 """Maximum correlation at a second lag, relative to the best one, of an unambiguous lag."""
-
 CONTEXT_S, MARGIN_S = 5.0, 0.1
 """[s] Interval beside the first and last knock that is compared, and beside a knock."""
-
 _Series: TypeAlias = tuple[FloatArray, FloatArray]
 """Times (n,) [s] and values (n,)."""
 
 
 @dataclass(frozen=True)
 class Lag:
-    """Clock offset of one sensor relative to another."""
+    """Clock offset [s] of one sensor relative to another, and its std; NaN if unknown."""
 
-    offset: float
-    """[s] Clock offset; NaN if it is unknown."""
-    std: float
-    """[s] Standard deviation of the offset."""
-    correlation: float
-    """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
-    reason: str
+    reason: str = ''
     """Reason for an unknown offset; empty if the offset is known."""
-
-
-def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
-    """Create a `Lag` with an unknown offset and the reason for it."""
-    return Lag(float('nan'), float('nan'), correlation, reason)
+    correlation: float = float('nan')
+    """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
+    offset: float = float('nan')
+    std: float = float('nan')
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
@@ -60,21 +49,19 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     `reference` and `signal` are shocks (see `shock`) at increasing times in s since the same zero;
     `max_lag` bounds the absolute offset, which is positive if the sensor's clock is ahead. The lag
     of the largest correlation ([T10]_ section 6.3) is refined below the sampling interval by least
-    squares. Raises ValueError for differing shapes, or times that do not increase.
+    squares.
     """
-    a, b = (_validated_series(t_reference, reference, 'reference'),
-            _validated_series(t, signal, 'sensor'))
-    a, b = _without_cut_knocks(*a), _without_cut_knocks(*b)
+    a, b = _without_cut_knocks(t_reference, reference), _without_cut_knocks(t, signal)
     separation = _knock_separation(a, b, max_lag)
     if separation is not None:
-        return _no_lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
+        return Lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
     a, b = _around_knocks(a, b, max_lag), _around_knocks(b, a, max_lag)
     for name, (_, s) in (('reference', a), ('sensor', b)):
         if not _has_knock(s):
-            return _no_lag(f'the {name} measured no knock')
+            return Lag(f'the {name} measured no knock')
     lag, correlation, reason = _coarse_lag(a, b, max_lag)
     if reason:
-        return _no_lag(reason, correlation)
+        return Lag(reason, correlation)
     # The series with the higher rate is interpolated.
     if _sampling_interval(*a) <= _sampling_interval(*b):
         offset, std = _refined_lag(a, b, lag)
@@ -82,20 +69,8 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
         offset, std = _refined_lag(b, a, -lag)
         offset = -offset
     if not abs(offset) <= max_lag:
-        return _no_lag(f'the knocks are {offset:.3f} s apart, maximum {max_lag:g} s', correlation)
-    return Lag(offset, std, correlation, '')
-
-
-def _validated_series(t: FloatArray, s: FloatArray, name: str) -> _Series:
-    """Remove NaN values from a series; raise ValueError for invalid shapes or times."""
-    t, s = np.asarray(t, dtype=float), np.asarray(s, dtype=float)
-    if t.shape != s.shape or t.ndim != 1:
-        raise ValueError(f'the {name} has times of shape {t.shape} for values of shape {s.shape}')
-    is_valid = ~np.isnan(s)
-    t, s = t[is_valid], s[is_valid]
-    if (np.diff(t) <= 0.0).any():
-        raise ValueError(f'the times of the {name} do not increase')
-    return t, s
+        return Lag(f'the knocks are {offset:.3f} s apart, maximum {max_lag:g} s', correlation)
+    return Lag('', correlation, offset, std)
 
 
 def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:

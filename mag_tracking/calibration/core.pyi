@@ -85,11 +85,10 @@ def subtract(sensors: StructArray, time: float, field: FloatArray, out: FloatArr
     """Subtract the background at `time` in s from a field (3,) T, into `out` (3,)."""
 
 def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
-    """Quantisation steps (3,) T of a sensor, after soft-iron correction if `are_corrected`; 0 if
-    too fine to be observed, inf if the axis has never changed."""
+    """`sensor_state.corrected_steps`, or those of the raw readings unless `are_corrected`."""
 
 def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
-    """Complete unknown `steps` (3,) T in place; see `sensor_state.completed_steps`."""
+    """`sensor_state.completed_steps` in place."""
 
 def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> None:
     """Add the quantisation variance of a sensor to its noise: reads `noise`; writes
@@ -101,12 +100,10 @@ def block_moments(sensors: StructArray) -> tuple[float, FloatArray, FloatArray, 
 
 def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
                  ) -> tuple[FloatArray, FloatArray]:
-    """Weighted least-squares line of each axis through the means `y` (k, 3) T of blocks of `n`
-    (k, 3) readings at `time` (k,) s: mean (3,) T at `centre` in s, and slope (3,) T/s."""
+    """`blocks.line_through` without the `centre` [s] that it computes."""
 
 def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
-    """Noise covariance (3, 3) T² from the scatter (k, 3, 3) T² within blocks of `n` (k, 3)
-    readings; see `blocks.pooled_covariance`."""
+    """Return `blocks.pooled_covariance`."""
 
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
     """Update the quantisation steps and the time of the latest change of each axis with a raw

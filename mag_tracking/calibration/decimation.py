@@ -23,8 +23,7 @@ def lowpass(factor: int) -> FloatArray:
     from scipy.signal import firwin, kaiserord
 
     n, beta = kaiserord(ATTENUATION_DB, 2.0 * (1.0 - PASS_FRACTION) / factor)
-    taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
-    return taps
+    return firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
 
 
 class Decimator:
@@ -77,9 +76,7 @@ class Decimator:
         return len(self._window) if self.factor is None else 0
 
     def noise_gain(self) -> float:
-        """Ratio of output to input variance of white noise; ValueError before the rate is known."""
-        if self.factor is None:
-            raise ValueError('the sampling rate of the sensor is not known yet')
+        """Ratio of output to input variance of white noise, once the rate is known."""
         return 1.0 if self._taps is None else float(self._taps @ self._taps)
 
     def _measure_rate(self) -> list[tuple[int, FloatArray]]:

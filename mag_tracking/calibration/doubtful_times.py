@@ -6,15 +6,12 @@ from typing import TypeAlias
 
 DoubtfulTimes: TypeAlias = tuple[tuple[int, int | None], ...]
 """((begin, end) [ns], ...), oldest first, ends excluded; an end of None is not known yet."""
-
 InputDoubts: TypeAlias = Mapping[str, Mapping[str, DoubtfulTimes]]
 """{reason: {sensor: intervals}}; the reasons are names of `stages.track.doubts`."""
-
 DOUBTFUL_BACKGROUND = 'doubtful_background'
 CONTRADICTS_EARTH_FIELD = 'contradicts_earth_field'
 WRONG_TIMESTAMPS = 'wrong_timestamps'
 """Reasons why the input of a sensor is doubtful."""
-
 MAX_INTERVALS = 16
 """Maximum number of intervals; the oldest intervals are removed."""
 

@@ -11,37 +11,28 @@ from mag_tracking.arrays import FloatArray, IntArray
 
 EMPTY_OCTANT = 0.125
 """Maximum weight of an empty octant relative to the mean weight of an octant."""
-
 N_CELLS = 500
 """Number of equal cells on the sphere of directions, about 10 degrees wide."""
-
 MAX_CELL_WEIGHT = 3.0
 """Maximum total weight of a cell, in multiples of the median number of readings per cell."""
-
 _OCTANTS = np.array(list(product([1.0, -1.0], repeat=3)))
 _OCTANT_NAMES = [''.join(name) for name in product(('+x', '-x'), ('+y', '-y'), ('+z', '-z'))]
 
 OUTLIER_STDS = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
-
 MIN_SCALE = 1e-9
 """Minimum standard deviation of residuals, relative to the radius; less is due to rounding."""
-
 POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or a field that is '
                    'not uniform')
 """Possible causes if the readings do not fit an ellipsoid."""
-
 LOSS_SCALE = 2.0
 """[std] Residual at which the loss changes from quadratic to linear."""
-
 N_BLOCKS = 40
 """Number of intervals of the block jackknife, longer than the correlation time of the residuals."""
-
 _ROWS, _COLUMNS = np.triu_indices(3)
 
 BASIS = np.zeros((6, 3, 3))
 """(6, 3, 3) Symmetric basis matrices of `correction`, one for each of its entries."""
-
 BASIS[range(6), _ROWS, _COLUMNS] = BASIS[range(6), _COLUMNS, _ROWS] = 1.0
 
 

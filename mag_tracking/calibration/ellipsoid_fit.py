@@ -9,46 +9,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.calibration.ellipsoid import (
-    BASIS,
-    POSSIBLE_CAUSES,
-    Quality,
-    fit_quadric,
-    refine_ellipsoid,
-)
-from mag_tracking.calibration.reading_faults import (
-    are_marked,
-    missing_marks,
-    saturated_readings,
-    with_margin,
-)
+from mag_tracking.calibration import ellipsoid, reading_faults
 
 MIN_READINGS, MIN_DIRECTIONS = 50, 18
 """Minimum number of readings, and of cells with readings: two for each of the nine parameters."""
-
 MIN_COVERAGE, GOOD_COVERAGE = 0.01, 0.1
 """Coverage at which errors of adjacent directions are amplified ten times (rejected), and three
 times (warning)."""
-
 MIN_THICKNESS = 0.05
 """Minimum ratio of smallest to largest spread of the readings; one axis of rotation has less."""
-
 MAX_AXIS_RATIO = 5.0
 """Maximum ratio of longest to shortest axis; soft iron on a sensor's board causes about two."""
-
 MAX_SCATTER = 0.1
 """Maximum scatter about the ellipsoid relative to its radius, without outliers: 0.01 to 0.03 is
 typical, the noise of a sensor at rest 0.3 to 0.4."""
-
 MAX_OFFSET_STD = 0.1
 """Maximum standard deviation of the offset relative to the radius, in the worst direction."""
-
 GOOD_RESIDUAL = 0.05
 """Coefficient of variation (std/mean) of corrected magnitudes above which a warning is issued."""
-
 GOOD_OUTLIER_FRACTION, MAX_OUTLIER_FRACTION = 0.01, 0.2
 """Fraction of outliers above which a warning is issued, or the scatter is not meaningful."""
-
 MIN_GLITCH_DISTANCE, MAX_GLITCH_FRACTION = 5.0, 0.02
 """Minimum distance of glitches (data transfer errors) from the median, in median distances, and
 their maximum fraction; more are due to a sensor that was mostly at rest."""
@@ -80,8 +60,6 @@ class EllipsoidFit:
     spherical harmonics f to degree two, which are the effects of the nine parameters on ‖B‖. One
     for even coverage, 0.008 for a hemisphere, zero for a ring. Errors shared by adjacent directions
     are amplified by up to 1/sqrt(coverage)."""
-    empty_octants: tuple[str, ...]
-    """Octants of the sensor frame with few or no corrected readings, e.g. '+x-y+z'."""
     n_readings: int
     """Number of readings used by the fit."""
     n_missing: int
@@ -102,8 +80,7 @@ class EllipsoidFit:
 
     def correct(self, readings: FloatArray) -> FloatArray:
         """Field (n, 3), in the unit of `field_magnitude`, of readings in the unit of `offset`."""
-        field: FloatArray = (np.asarray(readings, dtype=float) - self.offset) @ self.correction
-        return field
+        return (np.asarray(readings, dtype=float) - self.offset) @ self.correction
 
 
 def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) -> EllipsoidFit:
@@ -119,10 +96,11 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
     coverage and the rejection criteria are additions of this package.
     """
     readings = _validated(readings, field_magnitude)
-    marks = missing_marks(readings)
-    readings = np.where(are_marked(readings, marks), np.nan, readings)
+    marks = reading_faults.missing_marks(readings)
+    readings = np.where(reading_faults.are_marked(readings, marks), np.nan, readings)
     present: BoolArray = ~np.any(np.isnan(readings), axis=1)
-    is_saturated = with_margin(saturated_readings(readings)) & present[:, None]
+    is_saturated = reading_faults.saturated_readings(readings)
+    is_saturated = reading_faults.with_margin(is_saturated) & present[:, None]
     valid = readings[present & ~is_saturated.any(axis=1)]
     glitches = _glitches(valid)
     valid = valid[~glitches]
@@ -131,27 +109,27 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
         offset=np.full(3, nan), correction=np.full((3, 3), nan), field_magnitude=nan, residual=nan,
         residual_before=_relative_spread(np.linalg.norm(readings[present], axis=1)),
         offset_std=np.full(3, nan), correction_std=np.full((3, 3), nan), field_magnitude_std=nan,
-        coverage=nan, empty_octants=(), n_readings=len(valid), n_missing=int((~present).sum()),
+        coverage=nan, n_readings=len(valid), n_missing=int((~present).sum()),
         n_saturated=int(is_saturated.any(axis=1).sum()), n_outliers=int(glitches.sum()),
         reason=_insufficient_data(valid), warnings=_notes_on_input(present, is_saturated, marks))
     if fit.reason:
         return fit
     centre, scale = valid.mean(axis=0), float(np.sqrt(valid.var(axis=0).sum()))
     z = (valid - centre) / scale
-    o, C, reason = fit_quadric(z)
+    o, C, reason = ellipsoid.fit_quadric(z)
     if reason:
         return replace(fit, reason=reason)
-    o, C, P, quality = refine_ellipsoid(z, o, C)
+    o, C, P, quality = ellipsoid.refine_ellipsoid(z, o, C)
     axes = np.linalg.eigvalsh(C)
     if not axes[0] * MAX_AXIS_RATIO >= axes[2]:
         return replace(fit, reason=f'the axes of the ellipsoid have a ratio of {axes[0]:.2g} to '
-                       f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}')
+                       f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; '
+                       + ellipsoid.POSSIBLE_CAUSES)
     fit = _in_units(fit, o, C, P, centre, scale, field_magnitude)
     residual = _relative_spread(np.linalg.norm(fit.correct(readings[present]), axis=1))
     n_outliers = fit.n_outliers + quality.n_outliers
     outlier_fraction = n_outliers / (len(valid) + glitches.sum())
     return replace(fit, residual=residual, n_outliers=n_outliers, coverage=quality.coverage,
-                   empty_octants=quality.empty,
                    reason=_rejection_reason(C, P, quality, outlier_fraction),
                    warnings=fit.warnings + _notes_on_fit(residual, quality, outlier_fraction))
 
@@ -219,14 +197,14 @@ def _in_units(fit: EllipsoidFit, o: FloatArray, C: FloatArray, P: FloatArray, ce
               scale: float, field_magnitude: float | None) -> EllipsoidFit:
     """Add normalised parameters with their covariance `P` to the result, in its units."""
     volume = np.linalg.det(C)**(-1.0 / 3.0)
-    t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
+    t = np.einsum('ij,kji->k', np.linalg.inv(C), ellipsoid.BASIS)
     if field_magnitude is None:
         k, magnitude = volume, scale * volume
-        D = k * (BASIS - C * t[:, None, None] / 3.0)
+        D = k * (ellipsoid.BASIS - C * t[:, None, None] / 3.0)
         magnitude_std = magnitude / 3.0 * np.sqrt(t @ P[3:, 3:] @ t)
     else:
         k, magnitude, magnitude_std = field_magnitude / scale, float(field_magnitude), 0.0
-        D = k * BASIS
+        D = k * ellipsoid.BASIS
     return replace(
         fit, offset=centre + scale * o, correction=k * C, field_magnitude=float(magnitude),
         offset_std=scale * np.sqrt(np.diagonal(P)[:3]),
@@ -234,12 +212,12 @@ def _in_units(fit: EllipsoidFit, o: FloatArray, C: FloatArray, P: FloatArray, ce
         field_magnitude_std=float(magnitude_std))
 
 
-def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality,
+def _rejection_reason(C: FloatArray, P: FloatArray, quality: ellipsoid.Quality,
                       outlier_fraction: float) -> str:
     """Reason for the rejection of a fit; empty if the fit is accepted."""
     if quality.scatter > MAX_SCATTER:
         return (f'the scatter about the ellipsoid is {quality.scatter:.2g} of the radius, '
-                f'maximum {MAX_SCATTER}; {POSSIBLE_CAUSES}')
+                f'maximum {MAX_SCATTER}; {ellipsoid.POSSIBLE_CAUSES}')
     if outlier_fraction > MAX_OUTLIER_FRACTION:
         return (f'the fraction of outliers is {outlier_fraction:.2g}, maximum '
                 f'{MAX_OUTLIER_FRACTION}')
@@ -255,7 +233,8 @@ def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality,
     return '' if quality.solved else 'least squares did not converge in 100 evaluations'
 
 
-def _notes_on_fit(residual: float, quality: Quality, outlier_fraction: float) -> tuple[str, ...]:
+def _notes_on_fit(residual: float, quality: ellipsoid.Quality,
+                  outlier_fraction: float) -> tuple[str, ...]:
     """Warnings about coverage, residual and outliers."""
     checks = {
         f'the coverage is {quality.coverage:.2g}, recommended at least {GOOD_COVERAGE}':

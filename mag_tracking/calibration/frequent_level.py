@@ -15,33 +15,24 @@ from mag_tracking.calibration.blocks import Block, Blocks, line_through, pooled_
 
 MAX_CALM_RATIO = 3.0
 """Maximum std within a block, relative to the 20 % quantile of all blocks; a target exceeds it."""
-
 LEVEL_WIDTH, MIN_WIDTH = 4.0, 5e-9
 """Maximum difference between a block and its level per axis, in standard deviations of a mean, and
 at least [T], which allows for drift."""
-
 MIN_REPORTED_FRACTION = 0.5
 """An axis is evaluated if more than this fraction of the blocks contain it."""
-
 MIN_BLOCKS = 4
 """Minimum number of blocks of a level."""
-
 MIN_LEVEL_DISTANCE = 3.0
 """Minimum distance of another level, in widths. A distant target may change a level by less."""
-
 MIN_DURATION_RATIO = 4.0
 """Minimum duration of a level that replaces the initial level, relative to that of the latter."""
-
 BATCH_SIZE = 64
 """Number of blocks that are compared with all other blocks in one operation, to limit memory."""
-
 WAIT_RATIO = 2.0
 """Waiting time for a quiet interval, relative to its required length."""
-
 MIN_SEARCHED_BLOCKS, MAX_BLOCKS, SEARCH_GROWTH = 12, 240, 1.1
 """Minimum and maximum number of searched blocks (a minute of the usual length), and factor by which
 their number must grow between searches."""
-
 MIN_OBSERVED_S = 10.0
 """[s] Minimum total duration of a level that is considered certain."""
 
@@ -51,13 +42,11 @@ class MostFrequentLevel:
     """The most frequent level of a sensor."""
 
     n_blocks: int
-    """Number of blocks at the level."""
     n_rival: int
     """Number of blocks at the second most frequent level."""
     begin: float
-    """[s] Time of the first block at the level."""
     end: float
-    """[s] Time of the last block at the level."""
+    """[s] Times of the first and the last block at the level."""
     level: FloatArray
     """(3,) [T] Mean of the earliest blocks at the level; NaN for an unreported axis."""
     covariance: FloatArray

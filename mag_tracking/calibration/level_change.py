@@ -9,7 +9,6 @@ package.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -19,69 +18,36 @@ from mag_tracking.calibration.blocks import Blocks
 
 MAX_GAP = 2.5
 """Maximum interval between blocks, in median intervals."""
-
 MAX_SMALL_FRACTION = 0.3
 """Maximum magnitude of the evaluated ends of a change, as a fraction of the total magnitude."""
-
 DETECTION_STDS = 3.0
 """Detection limit of a change in standard deviations of the mean of a block, per axis."""
-
 MIN_ASYMMETRY = 0.8
 """Minimum asymmetry of a change for a decision, as a binary logarithm; 0 for equal ends."""
-
 MIN_GROWTH = 3.5
 """Minimum ratio of the largest evaluated magnitude to the detection limit."""
-
 MAX_QUARTER_FRACTION = 0.5
 """Maximum duration of a quarter, less one block, relative to the growth time; longer is a stall.
 The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300."""
-
 MAX_START_RATIO = 0.9
 """Maximum ratio of the first to the second half of the growth time at the near end. The theoretical
 ratio is 0.7 to 0.24 at the near end and 1.3 to 2.6 at the far end."""
-
 MIN_BLOCKS = 2.0
 """Minimum duration of the longer end in blocks; a step is neither an arrival nor a departure."""
-
 CLEAR_SIZE = 60.0
 """Minimum magnitude, in std of one reading, of a change that is classified alone."""
-
 MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the starts of the new levels at sensors near the same target."""
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Durations of the four quarters in which the magnitude of a change grows by a factor q.
+def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> FloatArray | None:
+    """Durations (4,) [s] of the quarters, on a logarithmic scale, of a growth from `low` to `high`.
 
-    If it grows with the inverse cube of a distance, each quarter takes q**(1/12) times as long as
-    the next; if with the square of time, q**(1/8) times as long as the previous one.
-    """
-
-    quarters: tuple[float, ...]
-    """(4,) [s] Duration of each quarter of the growth, on a logarithmic scale of the magnitude."""
-
-    @property
-    def early(self) -> float:
-        """Duration of the first two quarters [s]."""
-        return self.quarters[0] + self.quarters[1]
-
-    @property
-    def late(self) -> float:
-        """Duration of the last two quarters [s]."""
-        return self.quarters[2] + self.quarters[3]
-
-    @property
-    def duration(self) -> float:
-        """Total duration [s]."""
-        return self.early + self.late
-
-
-def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Growth | None:
-    """Measure the growth of `size` (k,) at increasing times (k,) in s, between `low` and `high`.
-
-    It ends where `size` first exceeds `high` and starts where it was last below `low` before. None
-    if it never exceeds `high`, was never below `low` before, or has a gap in between.
+    If `size` (k,), at increasing times (k,) in s, grows by a factor q with the inverse cube of a
+    distance, each quarter takes q**(1/12) times as long as the next; if with the square of time,
+    q**(1/8) times as long as the previous one. The growth ends where `size` first exceeds `high`
+    and starts where it was last below `low` before. None if it never exceeds `high`, was never
+    below `low` before, or has a gap in between.
     """
     times, end, begin = [], int(np.flatnonzero(size > high).min(initial=len(size))), 0
     for level in np.geomspace(low, high, 5):
@@ -94,7 +60,7 @@ def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Gr
         begin = begin or i
     if np.diff(time[begin - 1:end + 1]).max() > MAX_GAP * np.median(np.diff(time)):
         return None
-    return Growth(tuple(b - a for a, b in pairwise(times)))
+    return np.diff(times)
 
 
 @dataclass(frozen=True)
@@ -154,15 +120,17 @@ def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: Fl
     block_length = float(np.median(np.diff(time)))
     first = growth_of(time, distance_before, detection_limit, largest)
     last = growth_of(-time[::-1], distance_after[::-1], detection_limit, largest)
-    if largest < MIN_GROWTH * detection_limit or first is None or last is None \
-            or max(first.duration, last.duration) < MIN_BLOCKS * block_length \
-            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.duration + block_length
-                   for end in (first, last)):
+    if largest < MIN_GROWTH * detection_limit or first is None or last is None:
+        return 0.0
+    quarters = np.array([first, last])
+    halves = quarters.reshape(2, 2, 2).sum(axis=2)
+    durations = halves.sum(axis=1)
+    if durations.max() < MIN_BLOCKS * block_length or (
+            quarters.max(axis=1) > MAX_QUARTER_FRACTION * durations + block_length).any():
         return 0.0
     # The position of an end within a block is unknown.
-    duration_ratio = (last.duration + 0.5 * block_length) / (first.duration + 0.5 * block_length)
-    rise, fall = ((end.early + 0.25 * block_length) / (end.late + 0.25 * block_length)
-                  for end in (first, last))
+    duration_ratio = np.divide(*(durations[::-1] + 0.5 * block_length))
+    rise, fall = np.divide(*(halves.T + 0.25 * block_length))
     starts_slowly = (rise if duration_ratio > 1.0 else fall) < MAX_START_RATIO
     return float(np.log2(duration_ratio * fall / rise)) if starts_slowly else 0.0
 

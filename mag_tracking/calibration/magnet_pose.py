@@ -1,42 +1,23 @@
 """Position and direction of a magnet of known moment from one reading of a calibrated network."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.inference.least_squares import project_out_linear, refine
+from mag_tracking.inference.least_squares import ResidualAndJacobian, project_out_linear, refine
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 
 N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
-
 N_GRID, N_STARTS, MAX_STEPS = 7, 8, 60
-"""Number of grid points per axis of the search box, number of the best ones that are refined, and
-maximum number of steps."""
-
+"""Grid points per axis of the search box, number of the best ones to refine, maximum steps."""
 EXACT_COST = 1e-9
 """Maximum sum of squared residuals of exact readings, which rounding keeps above zero."""
-
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
-
-_Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Function that maps states (n, 9) to residuals (n, n_y) and Jacobians (n, n_y, 9)."""
-
-
-class PoseSettings(NamedTuple):
-    """Error model of the readings of a magnet."""
-
-    field_error: float = 0.01
-    """Error of sensors and dipole model relative to the field."""
-    ambient_std: float = 1e-7
-    """[T] Standard deviation of the change of the ambient field since the biases were estimated,
-    per axis; the change is the same at all sensors."""
 
 
 @dataclass(frozen=True)
@@ -61,16 +42,19 @@ class MagnetPose:
 
 
 def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
-                  high: ArrayLike, settings: PoseSettings) -> MagnetPose:
+                  high: ArrayLike, field_error: float, ambient_std: float) -> MagnetPose:
     """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
     The best points of a grid in the box between the corners `low` and `high` (3,) [m, world frame]
     are refined. `field` (n, 3) [T, sensor frame] is corrected for bias and gain; NaN if not
-    measured. Raises ValueError for an invalid reading,
-    moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
+    measured. `field_error` is that of sensors and dipole model relative to the field, `ambient_std`
+    [T] per axis that of the ambient field, which is the same at all sensors. Raises ValueError for
+    an invalid reading, moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
-    _check_input(network, field, moment, low, high)
+    if not (np.isfinite(high - low).all() and (high > low).all()):
+        raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
+    check_moment_and_noise(network, field, moment)
     is_measured = ~np.isnan(field)
     n_values = int(np.count_nonzero(is_measured))
     if n_values <= N_UNKNOWNS:
@@ -79,8 +63,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
                           f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
                           'required')
     squared_norm = np.nansum(np.square(field), axis=1)[:, None]
-    std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * squared_norm)
-    problem = _residual_function(network, field, std, is_measured, moment, settings.ambient_std)
+    std = np.sqrt(np.square(np.array(network.noise_std)) + field_error**2 * squared_norm)
+    problem = _residual_function(network, field, std, is_measured, moment, ambient_std)
     starts = _starting_states(network, field, std, is_measured, low, high)
     x, cost, covariance, converged = refine(problem, starts, MAX_STEPS, 1e-9)
     best = int(np.argmin(cost))
@@ -89,7 +73,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
 
 
 def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
-                       is_measured: BoolArray, moment: float, ambient_std: float) -> _Problem:
+                       is_measured: BoolArray, moment: float,
+                       ambient_std: float) -> ResidualAndJacobian:
     """Create the residual function of x = [position, axis (not normalised), ambient field in units
     of `ambient_std` (T)]."""
     y = (field / std)[is_measured]
@@ -148,17 +133,6 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
     else:
         reason = ''
     return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T, float(cost), reason)
-
-
-def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
-                 high: FloatArray) -> None:
-    """Raise ValueError if an input is invalid."""
-    if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
-        raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
-                         f'{field.shape}, {low.shape}, {high.shape}')
-    if not (np.isfinite(high - low).all() and (high > low).all()):
-        raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
-    check_moment_and_noise(network, field, moment)
 
 
 def check_moment_and_noise(network: SensorNetwork, field: FloatArray, moment: float) -> None:

@@ -10,14 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy.stats import chi2
 
+from mag_tracking import geometry
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.geometry import (
-    cross_matrix,
-    left_jacobian,
-    quaternion_between,
-    quaternion_from_rotation_vector,
-    rotation_from_quaternion,
-)
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 from mag_tracking.settings import param
@@ -26,22 +20,16 @@ N_SENSOR, N_SHARED, N_POSE = 10, 12, 8
 """Numbers of unknowns: per sensor (bias, gain, rotation, position); shared (shift and rotation of
 the board, offset and tilt of the magnet in the tool, log of the moment); per pose (position, tilt,
 ambient field)."""
-
 Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """Predicted readings and their derivatives; see `predicted_readings`."""
-
 OUTLIER_PROBABILITY = 1e-3
 """Readings whose residuals are less probable than this under the noise are down-weighted."""
-
 STEP_TOLERANCE = 1e-3
 """Squared norm of a step, in posterior standard deviations, below which the fit has converged."""
-
 MAX_DAMPING = 1e10
 """Damping factor at which the search for a step that reduces the cost is abandoned."""
-
 Unknowns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Unknowns of the sensors (n, 10), shared unknowns (12,) and unknowns of the poses (K, 8)."""
-
 Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
 """Return values of `GeometryProblem.weights`."""
 
@@ -49,13 +37,13 @@ Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
 def tool_rotations(axes: FloatArray) -> FloatArray:
     """Minimal rotations (K, 3, 3) from the tool frame to the tracker frame, from the tool's z axes,
     whose roll is not measured."""
-    return rotation_from_quaternion(
-        np.array([quaternion_between([0.0, 0.0, 1.0], a) for a in axes]))
+    return geometry.rotation_from_quaternion(
+        np.array([geometry.quaternion_between([0.0, 0.0, 1.0], a) for a in axes]))
 
 
 def rotation(v: FloatArray) -> FloatArray:
     """Rotation matrices (..., 3, 3) of rotation vectors [rad]."""
-    return rotation_from_quaternion(quaternion_from_rotation_vector(v))
+    return geometry.rotation_from_quaternion(geometry.quaternion_from_rotation_vector(v))
 
 
 @dataclass(frozen=True)
@@ -83,7 +71,7 @@ class TrackedMagnet:
         `pose`, (K, 3, 8).
         """
         K = len(self.tool)
-        R_b, J_b = rotation(shared[3:6]), left_jacobian(shared[3:6])
+        R_b, J_b = rotation(shared[3:6]), geometry.left_jacobian(shared[3:6])
         R = R_b @ self.R_tool
         arm = (self.tool - self.pivot) @ R_b.T + R @ shared[6:9]
         axis = np.hstack([shared[9:11] + pose[:, 3:5], np.ones((K, 1))])
@@ -94,9 +82,9 @@ class TrackedMagnet:
         dm_dtilt = self.moment * np.exp(shared[11]) * R @ slope
         dr, dm = np.zeros((2, K, 3, N_SHARED))
         dr[:, :, :3] = np.eye(3)
-        dr[:, :, 3:6] = -cross_matrix(arm) @ J_b
+        dr[:, :, 3:6] = -geometry.cross_matrix(arm) @ J_b
         dr[:, :, 6:9] = R
-        dm[:, :, 3:6] = -cross_matrix(m) @ J_b
+        dm[:, :, 3:6] = -geometry.cross_matrix(m) @ J_b
         dm[:, :, 9:11] = dm_dtilt
         dm[:, :, 11] = m
         dr_pose, dm_pose = np.zeros((2, K, 3, N_POSE))
@@ -133,8 +121,8 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
     by_sensor[..., :3] = np.eye(3)
     field = np.einsum('nij,nkj->nki', R_correction, nominal)
     by_sensor[..., 3] = field
-    by_sensor[..., 4:7] = ((gain * R_correction)[:, None] @ cross_matrix(nominal)
-                           @ left_jacobian(sensor[:, 4:7])[:, None])
+    by_sensor[..., 4:7] = ((gain * R_correction)[:, None] @ geometry.cross_matrix(nominal)
+                           @ geometry.left_jacobian(sensor[:, 4:7])[:, None])
     by_sensor[..., 7:] = dB_dr
     dr, dm, dr_pose, dm_pose = derivatives
     by_pose = dB_dm @ dm_pose - dB_dr @ dr_pose

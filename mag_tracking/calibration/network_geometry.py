@@ -11,11 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.calibration.magnet_pose import (
-    PoseSettings,
-    check_moment_and_noise,
-    locate_magnet,
-)
+from mag_tracking.calibration import magnet_pose
 from mag_tracking.calibration.network_fit import (
     N_POSE,
     N_SENSOR,
@@ -34,9 +30,8 @@ from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the first stage, while the poses are inaccurate."""
-
-INITIAL_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
-"""Settings of the search for the initial poses, while the biases are inaccurate."""
+COARSE_AMBIENT_STD = 1e-6
+"""[T] Assumed change of the ambient field in the search for the initial poses."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +106,12 @@ class NetworkGeometry:
 
 MIN_POSES = 3
 """Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
-
 MIN_POSE_VARIATION = 0.1
 """Minimum variation of the axis [rad], or of the position relative to the distance of the nearest
 sensor, of poses that determine the geometry."""
-
 MAX_CORRECTION, MAX_RESIDUAL_RATIO = 4.0, 3.0
 """Maximum correction in prior standard deviations, and residual relative to the median, of a sensor
 or pose that is not suspect."""
-
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the model."""
 
@@ -131,9 +123,8 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
 
     The posterior is maximised by the Levenberg-Marquardt method with robust weights. A rotation of
     the board has the same effect as a rotation of all sensors; the priors resolve this ambiguity.
-    PHD15 Paper A section 8 proposes such a calibration. Raises ValueError if a pose is invalid, has
-    no readings or is at a sensor, a reading is infinite, a sensor has no `noise_std`, or the moment
-    is not positive.
+    PHD15 Paper A section 8 proposes such a calibration. Raises ValueError if a pose is invalid or
+    at a sensor, a reading is infinite, a sensor has no `noise_std`, or the moment is not positive.
 
     `field` (K, n, 3) [T, sensor frame] contains the constant background; NaN if not measured.
     `positions` (K, 3) [m] are tracked points in a frame that differs from the world frame only by a
@@ -252,21 +243,15 @@ def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost
 def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArray,
                  axes: FloatArray, moment: float) -> None:
     """Raise ValueError if an input is invalid."""
-    K, n = len(positions), len(network)
-    if field.shape != (K, n, 3) or positions.shape != (K, 3) or axes.shape != (K, 3):
-        raise ValueError(f'expected field (K, {n}, 3), positions and axes (K, 3), got '
-                         f'{field.shape}, {positions.shape}, {axes.shape}')
-    if K == 0:
+    if not len(positions):
         raise ValueError('there are no poses; at least one pose is required')
-    check_moment_and_noise(network, field, moment)
-    for k in range(K):
+    magnet_pose.check_moment_and_noise(network, field, moment)
+    for k in range(len(positions)):
         if not (np.isfinite(positions[k]).all() and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
             raise ValueError(f'pose {k}: expected a finite position and a unit axis, got '
                              f'{positions[k].tolist()} and {axes[k].tolist()}')
         if (network.positions == positions[k]).all(axis=1).any():
             raise ValueError(f'pose {k}: {positions[k].tolist()} m is the position of a sensor')
-        if np.isnan(field[k]).all():
-            raise ValueError(f'pose {k}: no sensor has a reading')
 
 
 def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
@@ -305,13 +290,11 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
                    high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
     """Locate the magnet in each reading; return rows, positions and axes of the valid poses."""
-    if field.ndim != 3 or field.shape[1:] != (len(network), 3):
-        raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
     median = np.zeros(field.shape[1:])
     for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
         median[j, a] = np.nanmedian(field[:, j, a])
-    poses = [locate_magnet(network, B - median, moment, low, high, INITIAL_POSE_SETTINGS)
-             for B in field]
+    poses = [magnet_pose.locate_magnet(network, B - median, moment, low, high, COARSE_ERROR,
+                                       COARSE_AMBIENT_STD) for B in field]
     rows = np.flatnonzero([pose.converged for pose in poses])
     positions, axes = (np.array([getattr(poses[k], name) for k in rows]).reshape(-1, 3)
                        for name in ('position', 'axis'))

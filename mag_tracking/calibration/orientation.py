@@ -7,6 +7,7 @@ a calibration with a known target, because vehicle model errors are similar in a
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,33 +24,22 @@ from mag_tracking.records import Track
 
 GRAVITY, MAX_GRAVITY_DIFFERENCE = 9.81, 1.0
 """[m/s²] Gravity, and maximum difference of the magnitude of the acceleration at rest."""
-
 OUTLIER_STDS = 5.0
 """Distance from the median, in standard deviations, beyond which a reading is a knock."""
-
 MAX_RIVAL_COST, MAX_EQUAL_COST = 9.0, 1.0
 """Maximum cost difference of a rival heading, and of equally good headings."""
-
 MAX_HEADING_STD = np.deg2rad(60.0)
 """[rad] Maximum standard deviation of a heading."""
-
 MIN_INFORMATION_FRACTION = 0.05
 """Minimum information about a compared direction, relative to the track's best-known direction."""
 
 
-@dataclass(frozen=True)
-class UpDirection:
-    """Up direction of a sensor at rest."""
+class UpDirection(NamedTuple):
+    """Up direction of a sensor at rest, (3,) unit vector, sensor frame."""
 
     direction: FloatArray
-    """(3,) unit vector, sensor frame."""
-    size: float
-    """[m/s²] Measured magnitude of gravity."""
     std: float
     """[rad] Standard deviation of the direction, about each level axis."""
-    n: int
-    n_excluded: int
-    """Number of readings excluded as knocks or because they are not finite."""
 
 
 def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
@@ -76,8 +66,7 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
         raise ValueError(f'the acceleration at rest is {size:.3g}, not {GRAVITY} m/s^2'
                          + (' (is its unit g?)' if 0.8 < size < 1.2 else ''))
     scatter = float(at_rest.std(axis=0).max()) / np.sqrt(len(at_rest))
-    return UpDirection(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(at_rest),
-                       len(a) - len(at_rest))
+    return UpDirection(mean / size, float(np.hypot(scatter, bias)) / GRAVITY)
 
 
 @dataclass(frozen=True)

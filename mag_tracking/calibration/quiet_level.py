@@ -20,10 +20,8 @@ NEAR_STDS = 8.0
 """Maximum change of the initial level by an approaching target, in std of a reading."""
 NEAR_DURATION_RATIO = 1.5
 """Value that replaces `MIN_DURATION_RATIO` for levels that differ by at most `NEAR_STDS`."""
-
 LEVEL_WEIGHT = 0.3
 """Weight of the latest block in the exponential average of a drifting level."""
-
 MAX_BLOCKS = 4000
 """Maximum number of blocks to compare; in a longer recording, an even selection is used."""
 

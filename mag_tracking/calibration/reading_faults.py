@@ -19,10 +19,8 @@ from scipy.special import erf
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration import core
 
-MIN_READINGS = 3
-"""Minimum number of readings with the value of a mark."""
-MIN_OTHERS = 12
-"""Minimum number of other readings of the axis."""
+MIN_READINGS, MIN_OTHERS = 3, 12
+"""Minimum number of readings with the value of a mark, and of other readings of the axis."""
 MIN_JUMP = 30.0
 """Minimum difference between a mark and its neighbours, in standard deviations or steps."""
 MIN_ISOLATION = 10.0
@@ -39,10 +37,8 @@ MIN_TOGETHER = 0.9
 LARGEST = 1e30
 """[T] Limit to which values are clipped, so that differences do not overflow."""
 
-MIN_REPETITION = 1.2
-"""Minimum number of readings per measurement; timing jitter causes fewer repetitions."""
-MAX_REPETITION = 40.0
-"""Maximum number of readings per measurement."""
+MIN_REPETITION, MAX_REPETITION = 1.2, 40.0
+"""Minimum and maximum readings per measurement; timing jitter causes fewer repetitions."""
 MIN_LOG_ODDS = 24.0
 """Minimum significance of the regularity; random repetitions reach it with probability exp(-24)."""
 MIN_RESULTANT = 0.85
@@ -305,10 +301,9 @@ def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
     adjacent_change = np.maximum(adjacent_change, np.abs(change_before + change_after))
     height = np.minimum(np.abs(change_before), np.abs(change_after))
     smallest_change = np.min(np.abs(change), where=np.abs(change) > 0.0, initial=np.inf)
-    indices: IntArray = 2 + np.flatnonzero((np.sign(change_before) == -np.sign(change_after)) & (
+    return 2 + np.flatnonzero((np.sign(change_before) == -np.sign(change_after)) & (
         height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change))
         & (height > min_height))
-    return indices
 
 
 def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArray:

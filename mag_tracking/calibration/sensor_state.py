@@ -14,7 +14,6 @@ from mag_tracking.units import NEVER
 N_WINDOW, MIN_CHANGES, COARSE_FRACTION = core.N_WINDOW, core.MIN_CHANGES, core.COARSE_FRACTION
 """Number of raw readings in which faults of the driver are searched; minimum number of changes, and
 minimum fraction of repetitions, of a sensor that is stuck, or coarse (`screening.hpp`)."""
-
 FIRST_WINDOW = 64
 """Number of raw readings between the searches in the first `N_WINDOW` readings of a sensor."""
 

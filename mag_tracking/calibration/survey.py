@@ -36,16 +36,12 @@ from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
 """[s] Maximum gap between accelerations of one recording; earlier readings are discarded."""
-
 ACCELEROMETER_BIAS = 0.05
 """[m/s²] Bias of an accelerometer, per axis; it tilts the estimated vertical by 0.3 degrees."""
-
 MAX_CLOCK_OFFSET_S = 0.5
 """[s] Maximum offset between two clocks, and minimum interval between knocks."""
-
 MAX_ACCELERATIONS = 60_000
 """Maximum number of stored readings per accelerometer, which bounds the memory."""
-
 MIN_NOMINAL_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
 

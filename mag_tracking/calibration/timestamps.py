@@ -8,10 +8,8 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.units import NS
 
-WINDOW = 256
-"""Maximum number of latest readings that are examined together."""
-MIN_READINGS = 16
-"""Minimum number of readings that are examined."""
+WINDOW, MIN_READINGS = 256, 16
+"""Maximum and minimum number of latest readings that are examined together."""
 N_INTERVALS = 8
 """Number of latest intervals that determine the rate."""
 MAX_ERROR_S = 0.02

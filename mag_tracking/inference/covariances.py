@@ -16,9 +16,8 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
     NaN in `y` (n, 3) marks a missing axis, whose entries in `C` (n, 3, 3) are not read. Raises
     LinAlgError if a covariance is not positive definite.
     """
-    y, C = _contiguous(y, C)
     energy, axes = np.empty(len(y)), np.empty(len(y), dtype=np.int64)
-    if not core.energies(y, C, energy, axes):
+    if not core.energies(plain(y), plain(C), energy, axes):
         raise np.linalg.LinAlgError('a covariance is not positive definite')
     return energy, axes
 
@@ -29,16 +28,14 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     A pivot is the fraction of an axis's variance that the preceding axes do not explain; NaN or at
     most 0 if the covariance is not positive definite.
     """
-    y, C = _contiguous(y, C)
     out = np.empty(len(y))
-    core.smallest_pivots(y, C, out)
+    core.smallest_pivots(plain(y), plain(C), out)
     return out
 
 
 def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     """Whether covariances `C` (n, 3, 3) are finite, symmetric and positive definite over the axes
     measured in `y` (n, 3)."""
-    y, C = _contiguous(y, C)
     is_measured = ~np.isnan(y)
     finite = np.isfinite(C)
     is_used = is_measured[:, :, None] & is_measured[:, None, :]
@@ -48,14 +45,6 @@ def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     valid: BoolArray = (finite | ~is_used).all(axis=(1, 2)) & (asymmetry <= 1e-6 * largest) \
         & (smallest_pivots(y, C) > MIN_PIVOT)
     return valid
-
-
-def _contiguous(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Check the shapes of `y` and `C`, and convert them to contiguous arrays."""
-    if y.shape != (len(y), 3) or C.shape != (len(y), 3, 3):
-        raise ValueError('expected measurements (n, 3) and covariances (n, 3, 3), got '
-                         f'{y.shape} and {C.shape}')
-    return plain(y), plain(C)
 
 
 def second_moment(weights: FloatArray, differences: FloatArray,

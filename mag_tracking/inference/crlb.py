@@ -9,17 +9,13 @@ or not positive (semi)definite raise ValueError.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.inference.matrices import (
-    leading_broadcast,
-    triangular_factor,
-    unit_diagonal,
-    whitened,
-)
+from mag_tracking.inference.matrices import leading_broadcast, unit_diagonal, whitened
 
 RANK_TOLERANCE = 1e-12
 """Eigenvalues at or below this fraction of the largest eigenvalue count as zero."""
@@ -46,8 +42,7 @@ class Observability:
     """Observability of the states near the point at which a model is linearised."""
 
     eigenvalues: FloatArray
-    """Eigenvalues of the scaled information, (n_x,), ascending; zeros are subject to rounding of
-    either sign."""
+    """Ascending eigenvalues of the scaled information, (n_x,); zeros are subject to rounding."""
     condition_number: float
     """Largest over smallest eigenvalue, T10 eq. (5.8); infinite if there is a kernel."""
     kernel: FloatArray
@@ -72,9 +67,6 @@ def observability(information: ArrayLike, names: Sequence[str],
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
     scale = np.ones(len(J)) if scale is None else np.asarray(scale, dtype=float)
-    if len(names) != len(J) or scale.shape != (len(J),) or not np.all(scale > 0.0):
-        raise ValueError(f'expected names and positive scales of {len(J)} states, '
-                         f'got {list(names)} and {scale.tolist()}')
     w, V = np.linalg.eigh(scale[:, None] * J * scale)
     zero = w <= RANK_TOLERANCE * w[-1]
     return Observability(w, np.inf if zero.any() else w[-1] / w[0], scale[:, None] * V[:, zero],
@@ -95,7 +87,9 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     is_exact = np.isposinf(np.diagonal(prior))
     free = np.ix_(~is_exact, ~is_exact)
     unit_diagonal('prior', prior[free])
-    scale, root, kernel = _inverse_root(J[free] + prior[free])
+    scale, w, V = unit_diagonal('information', J[free] + prior[free])
+    zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
+    root, kernel = V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
     P = root @ root.T / (scale[:, None] * scale)
     is_unobservable = _is_in_kernel(kernel)
     P[is_unobservable] = P[:, is_unobservable] = np.nan
@@ -105,53 +99,18 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     return covariance
 
 
-def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
-    """Fisher information about the states `keep` (indices or mask) if all others are unknown.
-
-    This is the Schur complement J_kk - J_ko J_oo^-1 J_ok (TSP14 eq. (44)); its inverse is the block
-    of the bound. It is zero in directions that `bound` finds unobservable; eliminated states need
-    not be observable.
-    """
-    J = np.asarray(information, dtype=float)
-    try:
-        selected = np.arange(len(J))[np.asarray(keep)]
-    except IndexError as error:
-        raise ValueError(f'keep is not valid for {len(J)} states: {error}') from error
-    if len(set(selected.tolist())) != selected.size:
-        raise ValueError(f'keep contains a state twice: {selected.tolist()}')
-    scale, root, kernel = _inverse_root(J)
-    # The complement is not computed by subtraction: eliminated states that are barely observable
-    # would leave rounding errors that look like information. First find the directions (columns
-    # of U) outside the kernel ...
-    U, kernel_components, _ = np.linalg.svd(kernel[selected])
-    U = U[:, np.count_nonzero(kernel_components > _KERNEL_TOLERANCE):]
-    U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _KERNEL_TOLERANCE, U, 0.0)
-    # ... then invert the bound in these directions, U (U'PU)^-1 U'.
-    R = triangular_factor((U.T @ root[selected]).T)
-    W = scale[selected, None] * np.linalg.solve(R.T, U.T).T
-    return W @ W.T
-
-
 def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     """Fisher information (9, 9) about [r0, v0, m] of a known range at the CPA (closest approach).
 
     `r0` [m] is the position at time zero relative to the sensor, `std` [m] that of the range
-    (zero in TSP14). TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
+    (zero in TSP14). A range of zero, if `r0` is parallel to `v0`, does not make the scale
+    observable. TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
     Proposition 2 lacks a minus sign.
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
-    if r0.shape != (3,) or v0.shape != (3,):
-        raise ValueError(f'r0 and v0 must have shape (3,), got {r0.shape} and {v0.shape}')
-    if not (np.isfinite(std) and std > 0.0 and v0 @ v0 > 0.0):
-        raise ValueError('std must be positive and finite and v0 non-zero, got '
-                         f'{std} and {v0.tolist()}')
     t_cpa = -(r0 @ v0) / (v0 @ v0)
     r_cpa = r0 + t_cpa * v0
-    cpa_range = np.linalg.norm(r_cpa)
-    if not cpa_range > 1e-9 * np.linalg.norm(r0):
-        raise ValueError(f'r0 = {r0.tolist()} is parallel to v0 = {v0.tolist()}: a CPA range of '
-                         'zero does not make the scale observable (TSP14 Proposition 2)')
-    gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (cpa_range * std)
+    gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (np.linalg.norm(r_cpa) * std)
     return np.outer(gradient, gradient)
 
 
@@ -165,8 +124,6 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     singular. If P0 refers to the first measurement, pass F[0] = I and Q[0] = 0.
     """
     A = whitened(H, C)
-    if A.ndim < 3:
-        raise ValueError(f'H requires a leading axis of steps, got {np.shape(H)}')
     n_steps, n_x = len(A), A.shape[-1]
     F = leading_broadcast('F', F, (n_steps, n_x, n_x))
     Q = leading_broadcast('Q', Q, (n_steps, n_x, n_x))
@@ -180,7 +137,9 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
         # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must remain so.
         L = np.sqrt(np.diagonal(P))[:, None] * V * np.sqrt(np.maximum(w, 0.0))
         # P = L L' becomes L (I + L'A'A L)^-1 L'; QR avoids squares and subtractions.
-        R = triangular_factor(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]))
+        # The type stub of NumPy lists only the pair (Q, R).
+        R = cast(FloatArray, np.linalg.qr(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]),
+                                          mode='r'))
         G = np.linalg.solve(R.T, L.T)
         P = covariances[k] = G.T @ G
     return covariances
@@ -204,16 +163,7 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
     axis; `ratio` is 9.2 in T10. T10 eq. (5.20)-(5.24): eq. (5.23) prints the squared norm of R
     instead of the norm; moment and noise in eq. (5.22) are too small by a factor of about 450.
     """
-    distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
-    return distance
-
-
-def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale of J (n,) to unit diagonal, a root G (n, rank) of the pseudo-inverse G G' of the scaled
-    matrix, and an orthonormal basis (n, n - rank) of its kernel."""
-    scale, w, V = unit_diagonal('information', J)
-    zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
-    return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
+    return np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
 
 
 def _is_in_kernel(kernel: FloatArray) -> BoolArray:

@@ -25,16 +25,14 @@ target at the height of the sensor. For 0.6 % of random moments, the field rotat
 direction if the target is above the sensor by half its lateral distance, and for 2.2 % if it is
 above by the whole distance."""
 MAX_VERTICAL_COSINE = 0.2
-"""Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
-is treated as vertical."""
+"""Maximum direction cosine to a horizontal axis of a missing axis that counts as vertical."""
 
 
 class FieldRotation(NamedTuple):
     """Statistic of the sense of rotation of a field, treated as normally distributed."""
 
     correlation: float
-    """Correlation of the horizontal axes, T²; negative for a target that moves from left to
-    right."""
+    """Correlation of the horizontal axes, T²; negative for a target moving left to right."""
     variance: float
     """Variance of the correlation, T⁴."""
 
@@ -65,30 +63,11 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     n = len(field) - 2 * lag
     if lag < 1 or n < 1:
         raise ValueError(f'lag: expected 1 to {(len(field) - 1) // 2} samples, got {lag}')
-    floor = 2.0 * n / lag**2 * noise_std**4
-    estimate = noise_std**2 / lag**2 * _squared_lag_differences(field, lag) - floor
-    return FieldRotation(_correlation(field, lag), max(estimate, floor))
-
-
-def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRotation:
-    """Mean and variance of `field_rotation` for a noise-free field (n, 2) [T] that is zero outside
-    the window; PHD15 Paper B eq. (12), (14)."""
-    padded = np.pad(signal, ((lag, lag), (0, 0)))
-    return FieldRotation(
-        _correlation(padded, lag), noise_std**2 / lag**2 * _squared_lag_differences(padded, lag)
-        + 2.0 * len(signal) / lag**2 * noise_std**4)
-
-
-def _correlation(field: FloatArray, lag: int) -> float:
-    """Correlation [T²] of the axes at a lag without the first `lag` samples; PHD15 Paper B
-    eq. (5a)."""
     current, delayed = field[lag:-lag], field[2 * lag:]
-    return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
-
-
-def _squared_lag_differences(field: FloatArray, lag: int) -> float:
-    """Sum over both axes of the squared differences of samples two lags apart [T²]."""
-    return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
+    correlation = float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
+    floor = 2.0 * n / lag**2 * noise_std**4
+    estimate = noise_std**2 / lag**2 * float(np.sum(np.square(delayed - field[:-2 * lag]))) - floor
+    return FieldRotation(correlation, max(estimate, floor))
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:

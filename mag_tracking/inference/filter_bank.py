@@ -13,11 +13,9 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 
 _NEGLIGIBLE_LOG_RATIO = np.log(100.0)
-"""[nats] Maximum log-weight difference from the heaviest hypothesis. Lighter hypotheses do not
-affect the choice of the published hypothesis."""
+"""[nats] Log-weight difference from the heaviest hypothesis of those that `best` ignores."""
 _SINGULAR_TOLERANCE = 1e-15
-"""Fraction of the largest variance at or below which a variance counts as zero, as in
-`numpy.linalg.pinv`."""
+"""Fraction of the largest variance that counts as zero, as in `numpy.linalg.pinv`."""
 
 
 def log_sum_exp(a: ArrayLike) -> float:
@@ -46,8 +44,7 @@ class FilterBank:
     origin: IntArray
     """Index that each hypothesis had when the bank was created, (n_hyp,)."""
     nis: FloatArray
-    """Normalised innovation squared of the latest measurement, (n_hyp, n_sensors); NaN before the
-    first measurement and for missing sensors."""
+    """Normalised innovation squared of the latest frame, (n_hyp, n_sensors); NaN if missing."""
 
     @classmethod
     def from_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
@@ -126,9 +123,9 @@ class FilterBank:
         """Whether the `n` heaviest hypotheses have at least a given fraction of the weight."""
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= fraction)
 
-    def is_separated(self, i: int, distance: float = 3.0) -> BoolArray:
-        """Flag the hypotheses (n_hyp,) whose position differs from hypothesis `i` by more than the
-        Mahalanobis `distance`."""
+    def is_separated(self, i: int) -> BoolArray:
+        """Flag the hypotheses (n_hyp,) whose position differs from hypothesis `i` by a Mahalanobis
+        distance of more than three."""
         difference = self.x[:, :3] - self.x[i, :3]
         C = self.P[:, :3, :3] + self.P[i, :3, :3]
         try:
@@ -141,7 +138,7 @@ class FilterBank:
             # Directions without variance do not count.
             varies = variance > _SINGULAR_TOLERANCE * variance[:, -1:]
             z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
-        is_separated: BoolArray = z > distance**2
+        is_separated: BoolArray = z > 9.0
         return is_separated
 
     def reweight(self, log_likelihood: FloatArray) -> float:
@@ -187,8 +184,7 @@ def _class_indices(labels: IntArray) -> IntArray:
     """Class index (n,) of each hypothesis; hypotheses with equal `labels` have equal indices."""
     if labels.ndim == 1:
         return labels
-    classes: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
-    return classes
+    return np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:

@@ -23,15 +23,12 @@ class GaussMarkovVectors:
 
     Parameters
     ----------
-    scale : (m,), factor of `STRENGTHS` for each component; zero for constant components, which must
-        come last, otherwise ValueError
+    scale : (m,), factor of `STRENGTHS` for each component; zero for constant ones, which come last
     std : initial std of each component
     """
 
     def __init__(self, n: int, scale: FloatArray, std: float) -> None:
         m, n_moving, n_strengths = len(scale), np.count_nonzero(scale), len(STRENGTHS)
-        if not scale[:n_moving].all():
-            raise ValueError('scale: the zeros of constant components must come last')
         # [k, i]: strength k, component i.
         self._densities = np.square(STRENGTHS[:, None] * scale)
         # Constant components have no rate state: it would be exactly zero.

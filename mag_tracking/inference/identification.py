@@ -6,15 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
+from scipy.special import chdtri, softmax
 
 from mag_tracking.arrays import FloatArray
 
 UNKNOWN = 'unknown'
 """Name that is returned for an object that matches no class."""
 SIGNIFICANCE_LEVEL = 0.01
-"""Significance level of the chi-square tests; what is rejected for every class, or for every
-enrolled vehicle, is `UNKNOWN`."""
+"""Significance level of the chi-square tests; what every class or vehicle rejects is `UNKNOWN`."""
 
 
 class Feature(NamedTuple):
@@ -61,27 +60,20 @@ class Iron:
     """Soft iron D, m³."""
     covariance: FloatArray
     """Covariance of [m0, D], (4, 4), in the squared units of m0 [A m²] and D [m³]."""
-    residuals: FloatArray
-    """Measured minus predicted moments, (n, 3) A m², world frame."""
     normalised_cost: float
-    """Chi-square of the residuals per degree of freedom; about 1 if the model and the covariances
-    are correct. NaN without covariances."""
+    """Chi-square of the residuals per degree of freedom; about 1 if the model is correct."""
 
 
 def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: ArrayLike,
-                       covariances: ArrayLike | None = None) -> Iron:
+                       covariances: ArrayLike) -> Iron:
     """Estimate m0 and D in m = Rz(heading) m0 + D field_strength by least squares.
 
     `moments` (n, 3) [A m²] and `field_strength` = B0/mu0 [A/m] are in the world frame; with 3
-    B0/mu0, D is as defined in T10. Without `covariances`, moments have equal weight and the
-    residuals determine the covariance. TSP14 section VI.E; T10 eq. (6.16).
+    B0/mu0, D is as defined in T10. TSP14 section VI.E; T10 eq. (6.16).
     """
-    moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
-    field_strength = np.asarray(field_strength, dtype=float)
+    moments, headings, field_strength, covariances = (
+        np.asarray(a, dtype=float) for a in (moments, headings, field_strength, covariances))
     n = len(headings)
-    if moments.shape != (n, 3) or headings.shape != (n,) or field_strength.shape != (3,):
-        raise ValueError(f'expected moments (n, 3), headings (n,) and field_strength (3,), got '
-                         f'{moments.shape}, {headings.shape}, {field_strength.shape}')
     if not (np.isfinite(moments).all() and np.isfinite(headings).all()
             and np.isfinite(field_strength).all()):
         raise ValueError('moments, headings and field_strength must be finite')
@@ -90,7 +82,10 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
     A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = c, -s, s, c
     A[:, 2, 2] = 1.0
     A[:, :, 3] = field_strength
-    W = _whitening_matrices(covariances, n)
+    try:
+        W = np.linalg.inv(np.linalg.cholesky(covariances))
+    except np.linalg.LinAlgError:
+        raise ValueError('a covariance is not positive definite') from None
     whitened = (W @ A).reshape(3 * n, 4)
     # The units of m0 and D differ, so the columns are normalised first.
     scale = np.linalg.norm(whitened, axis=0)
@@ -103,23 +98,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
     theta = np.linalg.lstsq(whitened / scale, y, rcond=None)[0] / scale
     covariance = np.linalg.inv((whitened / scale).T @ (whitened / scale)) / np.outer(scale, scale)
     residual = y - whitened @ theta
-    cost = float(residual @ residual) / (3 * n - 4)
-    if covariances is None:
-        covariance, cost = covariance * cost, float('nan')
-    return Iron(theta[:3], float(theta[3]), covariance, moments - A @ theta, cost)
-
-
-def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """Inverse Cholesky factors (n, 3, 3) of `n` covariances, identity matrices if None."""
-    if covariances is None:
-        return np.tile(np.eye(3), (n, 1, 1))
-    covariances = np.asarray(covariances, dtype=float)
-    if covariances.shape != (n, 3, 3):
-        raise ValueError(f'expected covariances ({n}, 3, 3), got {covariances.shape}')
-    try:
-        return np.linalg.inv(np.linalg.cholesky(covariances))
-    except np.linalg.LinAlgError:
-        raise ValueError('a covariance is not positive definite') from None
+    return Iron(theta[:3], float(theta[3]), covariance, float(residual @ residual) / (3 * n - 4))
 
 
 PASS_TO_PASS_STD = 20.0
@@ -128,8 +107,7 @@ covariance of the fits (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
 MIN_HEADING_SEPARATION = np.deg2rad(45.0)
 """Minimum difference of headings that separates hard from soft iron [rad]."""
 HEADING_TOLERANCE = np.deg2rad(10.0)
-"""[rad] Maximum difference of headings at which a pass is compared with a vehicle that is enrolled
-at a single heading."""
+"""[rad] Maximum difference of the headings of a pass and of a vehicle enrolled at one heading."""
 
 
 @dataclass(frozen=True)
@@ -179,8 +157,6 @@ class Identification:
     distances: dict[str, float]
     """{vehicle: squared Mahalanobis distance}; chi-square distributed with three degrees of freedom
     for the true vehicle."""
-    not_compared: tuple[str, ...]
-    """Vehicles that are enrolled at another heading only."""
 
 
 def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: FloatArray,
@@ -209,25 +185,23 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,
              heading: float, heading_std: float, field_strength: FloatArray) -> Identification:
     """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame]."""
-    log_p, distances, skipped = {}, {}, []
+    log_p, distances = {}, {}
     for vehicle in vehicles:
         predicted = vehicle.moment_at(heading, heading_std, field_strength)
         if predicted is None:
-            skipped.append(vehicle.name)
             continue
         e, P = moment - predicted[0], predicted[1] + covariance
         distances[vehicle.name] = float(e @ np.linalg.solve(P, e))
         log_p[vehicle.name] = -0.5 * (distances[vehicle.name] + float(np.linalg.slogdet(P)[1]))
     if not log_p:
-        return Identification(UNKNOWN, {}, {}, tuple(skipped))
-    p = np.exp(np.array(list(log_p.values())) - max(log_p.values()))
+        return Identification(UNKNOWN, {}, {})
+    p = softmax(list(log_p.values()))
     best = max(log_p, key=lambda name: log_p[name])
     return Identification(
         best if min(distances.values()) <= chdtri(3, SIGNIFICANCE_LEVEL) else UNKNOWN,
-        dict(zip(log_p, (p / p.sum()).tolist(), strict=True)), distances, tuple(skipped))
+        dict(zip(log_p, p.tolist(), strict=True)), distances)
 
 
 def _wrapped(angle: FloatArray | float) -> FloatArray:
     """Angle wrapped to the interval from -pi to pi."""
-    wrapped: FloatArray = np.angle(np.exp(1j * np.asarray(angle)))
-    return wrapped
+    return np.angle(np.exp(1j * np.asarray(angle)))

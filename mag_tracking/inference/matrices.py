@@ -1,7 +1,6 @@
 """Matrix validation, scaling to unit diagonal, whitening and pseudo-inverses."""
 
 from contextlib import AbstractContextManager
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -73,12 +72,6 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     return scale, w, V
 
 
-def triangular_factor(A: FloatArray) -> FloatArray:
-    """Upper triangular factor R (min(m, n), n) of the QR decomposition A = Q R."""
-    # The type stub of NumPy lists only the pair (Q, R).
-    return cast(FloatArray, np.linalg.qr(A, mode='r'))
-
-
 def ignoring_overflow() -> AbstractContextManager[None]:
     """Suppress overflow and invalid-value warnings: a diverging search gets an infinite cost."""
     return np.errstate(over='ignore', invalid='ignore')
@@ -133,8 +126,7 @@ class MarginalWhitener:
 
     def __call__(self, A: FloatArray) -> FloatArray:
         """Return `A`, (..., n_y, k) or (n_y,), multiplied by the inverse root of I + C C'."""
-        whitened: FloatArray = A - (self._U * self._attenuation) @ (self._U.T @ A)
-        return whitened
+        return A - (self._U * self._attenuation) @ (self._U.T @ A)
 
     def correction_factor(self, A: FloatArray) -> FloatArray:
         """Factor F(A) (q, k) of the low-rank correction in A' inv(I + C C') B = A'B - F(A)'

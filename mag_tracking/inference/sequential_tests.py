@@ -37,8 +37,7 @@ class SlidingSum:
 BAYES_FACTOR_WINDOW_S = 1.0
 """Length of the sliding window of `TargetBayesFactor.is_recently_disfavoured` [s]."""
 MIN_LOG_RATIO = -30.0
-"""Log Bayes factor [nats] at or below which a track cannot become a target again, regardless of its
-fit."""
+"""Log Bayes factor [nats] at or below which a track cannot become a target again."""
 
 
 class TargetBayesFactor:
@@ -70,8 +69,7 @@ class TargetBayesFactor:
         self._recent_sum.add(stamp_ns, log_ratio)
 
     def would_be_favoured(self, log_ratio: float, min_bayes_factor: float) -> bool:
-        """Whether a target would be favoured if the log-likelihood of the track increased by
-        `log_ratio` [nats]."""
+        """Whether a target is favoured if the log-likelihood increases by `log_ratio` [nats]."""
         return self._is_known and self.log_ratio > MIN_LOG_RATIO \
             and self.log_ratio + log_ratio >= float(np.log(min_bayes_factor))
 
@@ -80,8 +78,7 @@ class TargetBayesFactor:
         return self._is_known and self.log_ratio >= float(np.log(min_bayes_factor))
 
     def is_recently_disfavoured(self, min_bayes_factor: float) -> bool:
-        """Whether the Bayes factor of the latest `BAYES_FACTOR_WINDOW_S` favours the
-        alternative."""
+        """Whether the Bayes factor of the latest second favours the alternative."""
         return bool(self._recent_sum.total < -np.log(min_bayes_factor))
 
     def disfavoured_s(self, stamp_ns: int) -> float:

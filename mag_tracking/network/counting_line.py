@@ -12,10 +12,8 @@ from mag_tracking.units import NS
 
 Pose: TypeAlias = Track | SmoothedPose
 """Filtered or smoothed pose of a track."""
-
 MIN_SPEED = 1.0
 """Minimum speed for extrapolation to a line [m/s]. Slower vehicles may stop before the line."""
-
 MAX_EXTRAPOLATION_S = 1.0
 """Maximum extrapolation time from the beginning or end of a track to a line [s]."""
 

@@ -8,7 +8,6 @@ import datetime
 import json
 import re
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
@@ -58,8 +57,7 @@ _NUMBERS: dict[str, tuple[tuple[int, ...], Callable[[FloatArray], Any], str]] = 
                      ": {0[0]} s exceeds 3600 s; set the sensor's clock"),
     'earth_field': ((3,), lambda B: np.linalg.norm(B) <= 1e-3,
                     ': {} T exceeds a millitesla; is the value in microtesla or gauss?')}
-"""How many numbers a key has, which are valid, and the error otherwise. One number may stand for
-three equal ones."""
+"""Lengths, validity and error of the numbers of a key; one may stand for three equal ones."""
 
 
 def _numbers(prefix: str, key: str, value: object) -> FloatArray:
@@ -237,25 +235,12 @@ def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
     latitude, longitude, height, azimuth = _parse_vector('site', [
         site[key] for key in ('latitude', 'longitude', 'height', 'x_azimuth_deg')], (4,))
     try:
-        return earth_field(Site(latitude, longitude, height, decimal_year(date), azimuth))
+        return earth_field(latitude, longitude, height, decimal_year(date), azimuth)
     except ValueError as error:
         raise NetworkError(f'site: {error}') from error
     except ModuleNotFoundError as error:
         raise NetworkError('site: the World Magnetic Model requires pygeomag: run pip install '
                            'pygeomag, or set earth_field instead') from error
-
-
-@dataclass(frozen=True)
-class Site:
-    """Geodetic latitude [deg], longitude [deg, east positive], height above the ellipsoid [m],
-    decimal year, and bearing of the x axis [deg, clockwise from true north]: 90 for ENU, or that of
-    a road parallel to x."""
-
-    latitude: float
-    longitude: float
-    height: float
-    year: float
-    x_azimuth: float
 
 
 def decimal_year(day: datetime.date) -> float:
@@ -264,24 +249,29 @@ def decimal_year(day: datetime.date) -> float:
     return day.year + (day - first).days / (datetime.date(day.year + 1, 1, 1) - first).days
 
 
-def earth_field(site: Site) -> FloatArray:
-    """Magnetic flux density (3,) of the Earth at a site, T, world frame (z up); raises ValueError
-    outside the model, and ModuleNotFoundError without pygeomag."""
+def earth_field(latitude: float, longitude: float, height: float, year: float,
+                x_azimuth: float) -> FloatArray:
+    """Magnetic flux density (3,) of the Earth at a site, T, world frame (z up).
+
+    Geodetic latitude [deg], longitude [deg, east positive], height above the ellipsoid [m], decimal
+    year, and bearing of the x axis [deg, clockwise from true north]: 90 for ENU, or that of a road
+    parallel to x. Raises ValueError outside the model, ModuleNotFoundError without pygeomag.
+    """
     # Optional dependency, required only for networks that define a site instead of a field.
     from pygeomag import GeoMag
 
     for name, value, low, high, unit in (
-            ('latitude', site.latitude, -90.0, 90.0, 'deg'),
-            ('longitude', site.longitude, -180.0, 360.0, 'deg'),
-            ('height', site.height, -1000.0, 850e3, 'm'),
-            ('year', site.year, FIRST_YEAR, LAST_YEAR, '(WMM2025)'),
-            ('x_azimuth', site.x_azimuth, -360.0, 360.0, 'deg')):
+            ('latitude', latitude, -90.0, 90.0, 'deg'),
+            ('longitude', longitude, -180.0, 360.0, 'deg'),
+            ('height', height, -1000.0, 850e3, 'm'),
+            ('year', year, FIRST_YEAR, LAST_YEAR, '(WMM2025)'),
+            ('x_azimuth', x_azimuth, -360.0, 360.0, 'deg')):
         if not low <= value <= high:
             raise ValueError(f'{name}: {value:g} is outside {low:g} .. {high:g} {unit}')
     field = GeoMag(coefficients_file=COEFFICIENTS).calculate(
-        glat=site.latitude, glon=site.longitude, alt=site.height * 1e-3, time=site.year)
+        glat=latitude, glon=longitude, alt=height * 1e-3, time=year)
     north, east, down = np.array([field.x, field.y, field.z]) * 1e-9
-    azimuth = np.deg2rad(site.x_azimuth)
+    azimuth = np.deg2rad(x_azimuth)
     return np.array([north * np.cos(azimuth) + east * np.sin(azimuth),
                      north * np.sin(azimuth) - east * np.cos(azimuth), -down])
 

@@ -38,8 +38,6 @@ are a in B_actual = B_nominal + a x B_nominal; for a sensor rotated by +b, a = -
 def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Broadcast `r` and `m` to contiguous arrays of a common shape (..., 3)."""
     r, m = np.broadcast_arrays(np.asarray(r, dtype=float), np.asarray(m, dtype=float))
-    if r.shape[-1:] != (3,):
-        raise ValueError(f'r and m require a last axis of length 3, got shape {r.shape}')
     return np.ascontiguousarray(r), np.ascontiguousarray(m)
 
 

@@ -94,16 +94,14 @@ class RowPass:
 
     def with_nonnegative_length(self, theta: FloatArray,
                                 p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Equivalent parameters with a non-negative length: a row of negative length has reversed
-        dipoles."""
+        """Equivalent parameters without a negative length, which means reversed dipoles."""
         if self.n_dipoles == 1 or theta[6] >= 0.0:
             return theta, p
         moments = (self.combinations @ p).reshape(-1, 3)[::-1]
         return np.append(theta[:6], -theta[6]), self.combinations.T @ moments.ravel()
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN where a dipole is at a
-        sensor."""
+        """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN for a dipole at a sensor."""
         A = core.row_bases(np.ascontiguousarray(theta), self._offsets, self.t, self.positions,
                            self.M)
         return A @ self.combinations if self.n_dipoles > 1 else A
@@ -117,8 +115,7 @@ class RowPass:
 
 @dataclass(frozen=True)
 class SuperposedPasses:
-    """Simultaneous passes of several rows whose fields are added; their parameters are
-    concatenated."""
+    """Simultaneous passes of several rows: their parameters are concatenated."""
 
     rows: tuple[RowPass, ...]
 
@@ -193,11 +190,9 @@ class SteadyPass:
     """
 
     t: FloatArray
-    """As in `RowPass`."""
     positions: FloatArray
-    """As in `RowPass`."""
     M: FloatArray
-    """As in `RowPass`."""
+    """These three are as in `RowPass`."""
     clock: IntArray
     """Index of the clock of each sample, (n,); -1 for the reference clock, which has no offset."""
     free: IntArray
@@ -227,8 +222,7 @@ class SteadyPass:
         return out
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN where a dipole is at a
-        sensor."""
+        """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN for a dipole at a sensor."""
         A = core.steady_bases(self.all_parameters(theta), self.offsets, self.t, self.positions,
                               self.M, self.clock)
         return A @ self._moment_transform
@@ -238,5 +232,4 @@ class SteadyPass:
         D = core.steady_derivatives(
             self.all_parameters(theta), p @ self._moment_transform.T, self.offsets, self.t,
             self.positions, self.M, self.clock)
-        free: FloatArray = D[:, :, self.free]
-        return free
+        return D[:, :, self.free]

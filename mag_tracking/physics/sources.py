@@ -14,13 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mag_tracking import geometry
 from mag_tracking.arrays import FloatArray
-from mag_tracking.geometry import (
-    cross_matrix,
-    left_jacobian,
-    quaternion_from_rotation_vector,
-    rotation_from_quaternion,
-)
 from mag_tracking.physics import core
 
 _INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
@@ -90,9 +85,8 @@ class SourceModel(Protocol):
         Dipoles
         """
 
-    def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
-                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predict target states.
+    def propagate(self, x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Predict target states; the compiled filter adds process noise.
 
         Parameters
         ----------
@@ -100,9 +94,6 @@ class SourceModel(Protocol):
             Target states.
         dt : float, s
             Prediction interval; negative to propagate backwards.
-        P : (n_hyp, n_t, n_t) array, optional
-            Covariances of `x`. If given, `Q` includes the second-order terms that the Jacobian
-            neglects, and a state of zero variance may be treated as constant.
 
         Returns
         -------
@@ -110,8 +101,6 @@ class SourceModel(Protocol):
             States after `dt`.
         F : (..., n_t, n_t) array
             Jacobian of the prediction.
-        Q : (..., n_t, n_t) array
-            Covariance of the process noise.
         """
 
 
@@ -139,62 +128,22 @@ class Magnet:
         dm_dx[:, 0, [0, 1, 2], [6, 7, 8]] = 1.0
         return Dipoles(x[:, None, :3].copy(), x[:, None, 6:9].copy(), dr_dx, dm_dx)
 
-    def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
-                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def propagate(self, x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
         """Predict target states at constant velocity and constant angular velocity.
 
-        The process noise of a double integrator is mapped to the moment by w -> w x m. The moment
-        is rotated by the full angle w dt: the first-order m + dt (w x m) of PHD15 Paper A eq. (24)
-        lengthens it by half the squared angle in each step, and a filter with a known moment
-        magnitude would overestimate the distance.
+        The moment is rotated by the full angle w dt: the first-order m + dt (w x m) of PHD15 Paper
+        A eq. (24) lengthens it by half the squared angle in each step, and a filter with a known
+        moment magnitude would overestimate the distance.
         """
         n, rotation_vector = len(x), dt * x[:, 9:12]
-        R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))
+        R = geometry.rotation_from_quaternion(
+            geometry.quaternion_from_rotation_vector(rotation_vector))
         predicted = x.copy()
         predicted[:, :3] += dt * x[:, 3:6]
         predicted[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
-        C = -cross_matrix(predicted[:, 6:9])
         F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
         F[:, 6:9, 6:9] = R
-        F[:, 6:9, 9:12] = dt * C @ left_jacobian(rotation_vector)
-        G = np.zeros((n, 6, 6))
-        G[:, :3, :3] = C
-        G[:, 3:, 3:] = np.eye(3)
-        Q = np.zeros((n, 12, 12))
-        Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        Q[:, 6:, 6:] = (G @ integrator_noise(dt, np.full(3, self.angular_density))
-                        @ np.swapaxes(G, 1, 2))
-        if P is not None:
-            # The uncertainty of the moment is rotated exactly. Only the increase due to the
-            # uncertain rotation is added.
-            P_before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
-            P_after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
-            Q[:, 6:9, 6:9] += _second_order_noise(predicted[:, 6:9], P_before, P_after)
-        return predicted, F, Q
-
-
-def _second_order_noise(m: FloatArray, P_before: FloatArray, P_after: FloatArray) -> FloatArray:
-    """Process noise (n, 3, 3) due to the shortening of the moment m by an uncertain rotation.
-
-    A rotation by small angles (a, b) about axes perpendicular to `m` (n, 3) shortens the component
-    along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With variances p, q of a, b, its
-    second moment is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. The noise is along m; its variance is the
-    increase of this moment from `P_before` to `P_after` (n, 3, 3), at most |m|^2.
-    """
-    squared_norm = np.einsum('ni,ni->n', m, m)
-    outer_product = np.einsum('ni,nj->nij', m, m)
-    # The result for a zero moment is zero because `outer_product` is zero.
-    squared_norm = np.where(squared_norm > 0.0, squared_norm, 1.0)
-    normal_projection = np.eye(3) - outer_product / squared_norm[:, None, None]
-
-    def second_moment(P: FloatArray) -> FloatArray:
-        S = normal_projection @ P @ normal_projection / squared_norm[:, None, None]
-        # The sum of the two variances and the sum of their squares are sufficient.
-        moment: FloatArray = 0.25 * (2.0 * np.einsum('nij,nji->n', S, S)
-                                     + np.trace(S, axis1=1, axis2=2) ** 2)
-        return moment
-
-    increase = np.clip(second_moment(P_after) - second_moment(P_before), 0.0, 1.0)
-    noise: FloatArray = increase[:, None, None] * outer_product
-    return noise
+        F[:, 6:9, 9:12] = -dt * geometry.cross_matrix(predicted[:, 6:9]) \
+            @ geometry.left_jacobian(rotation_vector)
+        return predicted, F

@@ -12,7 +12,7 @@ from scipy.special import elliprd
 from mag_tracking.arrays import FloatArray
 from mag_tracking.physics import core
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.physics.sources import Dipoles, constant_velocity, decaying_turn, integrator_noise
+from mag_tracking.physics.sources import Dipoles, constant_velocity, decaying_turn
 
 
 def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -121,53 +121,26 @@ class RowVehicle:
         """Magnetic field strength B0/mu0 of the Earth, (3,) A/m, world frame."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
-    @cached_property
-    def _moment_walk(self) -> FloatArray:
-        """Random walk covariance (3 d, 3 d) [1/s] of the hard iron moments, normalised by the
-        squared magnitude of the hard and soft iron moments."""
-        d = self.n_dipoles
-        averaging = np.full((d, d), 1.0 / d)
-        return np.kron(self.moment_drift**2 / d * averaging
-                       + self.difference_drift**2 * (np.eye(d) - averaging), np.eye(3))
-
     def dipoles(self, x: FloatArray) -> Dipoles:
         """Compute the dipoles of target states (n_hyp, n_t)."""
-        if x.shape[1:] != (len(self.state_names),):
-            raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
-                             f'got an array of shape {x.shape}')
         return Dipoles(*core.row_dipoles(np.ascontiguousarray(x, dtype=float), self.n_dipoles,
                                          self.field_strength))
 
-    def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
-                  ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def propagate(self, x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
         """Predict states at constant velocity, or along an arc if the state has a turn rate.
 
-        Backwards, or with zero variance in `P` so that straight paths remain straight, the turn
-        rate has no process noise. Without a turn rate, `F` (n_t, n_t) is common to all hypotheses.
-        The effect of the turn rate noise on position and velocity is neglected.
+        Without a turn rate, `F` (n_t, n_t) is common to all hypotheses.
         """
-        n, soft = x.shape[1], 6 + 3 * self.n_dipoles
-        Q = np.zeros((len(x), n, n))
-        Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        hard = x[:, 6:soft].reshape(len(x), self.n_dipoles, 3).sum(axis=1)
-        induced2 = x[:, soft:soft + 3]**2 * (self.field_strength @ self.field_strength) / 3.0
-        Q[:, 6:soft, 6:soft] = abs(dt) * self._moment_walk * (hard**2 + induced2).sum(
-            axis=1)[:, None, None]
         if not self.turn_acceleration:
-            F = np.eye(n)
+            F = np.eye(x.shape[1])
             F[:6, :6] = constant_velocity(dt)
-            return x @ F.T, F, Q
+            return x @ F.T, F
         # The turn rate does not decay backwards: without process noise, its variance would shrink.
         final_factor = math.exp(-max(dt, 0.0) / self.turn_time)
         mean_factor = (1.0 - final_factor) * self.turn_time / dt if dt > 0.0 else 1.0
-        predicted, F_turn = decaying_turn(x, dt, mean_factor, final_factor)
-        is_turning = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
-        Q[:, -1, -1] = is_turning * (1.0 - final_factor**2) * self.turn_variance(
-            np.hypot(x[:, 3], x[:, 4]))
-        return predicted, F_turn, Q
+        return decaying_turn(x, dt, mean_factor, final_factor)
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
         """Stationary variance [rad²/s²] of the turn rate at a horizontal speed."""
         min_speed = self.turn_acceleration / MAX_TURN_RATE
-        variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, min_speed))
-        return variance
+        return np.square(self.turn_acceleration / np.maximum(speed, min_speed))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.consistency import error_over_bound
+from mag_tracking.analysis.track_errors import error_over_bound
 from mag_tracking.analysis.track_log import TrackLog
 from support.passes import NOISE, ROAD
 

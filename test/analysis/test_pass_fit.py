@@ -268,8 +268,6 @@ def test_one_sensor_with_a_known_range_determines_all_parameters():
     assert (np.abs(error) < 3.0 * np.sqrt(np.diagonal(fit.covariance)[:9])).all()
     # The relative std of the speed equals the relative std of the range.
     assert fit.speed[1] / fit.speed[0] == pytest.approx(0.2 / distance, rel=0.2)
-    with pytest.raises(ValueError, match='single sensor'):
-        fit_pass(measured(ROAD, path, moments, np.random.default_rng(1)), 1, (4.0, 0.1))
 
 
 def test_a_moment_perpendicular_to_the_plane_leaves_directions_unknown():
@@ -314,8 +312,6 @@ def test_data_that_cannot_be_fitted_result_in_a_reason():
     far = path.copy()
     far[1] += 45.0
     assert 'range' in reason(measured(ROAD, far, moments, rng), 1)
-    with pytest.raises(ValueError, match='dipole'):
-        fit_pass(data, 0)
 
 
 def test_two_vehicles_in_one_window_are_rejected():

@@ -24,6 +24,7 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.initiation_vehicle import REFERENCE_FIELD, vehicle_model
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.units import NS
+from support.process_noise import predicted
 
 PERIOD, SIGMA, STEPS = 0.08, 1.2e-8 / np.sqrt(8.0), 26
 NETWORK = SensorNetwork(
@@ -82,7 +83,7 @@ def truths(model, settings, rng):
     Q.append(np.zeros((n_t + 6, n_t + 6)))
     walk = settings.background_drift**2 * PERIOD * np.eye(6)
     for _ in range(STEPS - 1):
-        propagated, F_t, Q_t = model.propagate(states[-1][None, :n_t], PERIOD)
+        propagated, F_t, Q_t = predicted(model, states[-1][None, :n_t], PERIOD)
         F.append(block_diag(F_t, np.eye(6)))
         Q.append(block_diag(Q_t[0], walk))
         states.append(np.append(propagated[0], states[-1][n_t:])

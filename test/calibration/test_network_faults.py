@@ -157,11 +157,8 @@ def test_a_magnet_of_opposite_polarity_is_rejected():
 
 
 @pytest.mark.parametrize('change, message', [
-    ({'field': np.zeros((5, 8, 3))}, r'expected field \(K, 9, 3\)'),
-    ({'positions': np.zeros((5, 2))}, 'positions'),
     ({'axes': np.ones((5, 3))}, 'pose 0: .*unit axis'),
     ({'positions': np.full((5, 3), np.nan)}, 'pose 0: .*position'),
-    ({'field': np.full((5, 9, 3), np.nan)}, 'pose 0: .*reading'),
     ({'field': np.full((5, 9, 3), np.inf)}, 'infinite'),
     ({'positions': np.full((5, 3), 0.0)},
      r'pose 0: \[0.0, 0.0, 0.0\]'),

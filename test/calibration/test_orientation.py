@@ -32,7 +32,7 @@ POSTURES = {'upright': np.eye(3), 'upside down': Rotation.from_euler('x', 180.0,
 
 def up_of(R_ws, std=0.0):
     """`UpDirection` of a sensor with orientation `R_ws`."""
-    return UpDirection(R_ws.T @ UP, GRAVITY, std, 100, 0)
+    return UpDirection(R_ws.T @ UP, std)
 
 
 def angles_between(R, S):
@@ -57,9 +57,7 @@ def test_up_direction_rotates_with_the_sensor(R):
     np.testing.assert_allclose(rotated.direction, R.T @ up.direction, atol=2e-3)
     exact = up_direction(at_rest(R, noise=0.0), 0.05)
     np.testing.assert_allclose(exact.direction, R.T @ UP, atol=1e-12)
-    assert exact.size == pytest.approx(GRAVITY)
     assert exact.std == pytest.approx(0.05 / GRAVITY)
-    assert (exact.n, exact.n_excluded) == (200, 0)
 
 
 def test_knocks_and_readings_that_are_not_finite_are_excluded():
@@ -68,12 +66,11 @@ def test_knocks_and_readings_that_are_not_finite_are_excluded():
     a[50:60] += [30.0, -20.0, 10.0]
     a[70], a[71, 1] = np.nan, np.inf
     up = up_direction(a, 0.0)
-    assert up.n_excluded >= 12 and up.n + up.n_excluded == 200
     assert np.arccos(up.direction @ expected.direction) < 1e-3
     # An accelerometer with coarse steps has no scatter at rest.
     coarse = np.tile([0.0, 0.0, GRAVITY], (50, 1))
     coarse[20] += [0.0, 5.0, 0.0]
-    assert up_direction(coarse, 0.0).n == 49
+    np.testing.assert_array_equal(up_direction(coarse, 0.0).direction, [0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize('a, message', [
@@ -120,7 +117,7 @@ def test_orientation_rotates_with_the_sensor(R, S):
     rng = np.random.default_rng(0)
     y, up = R.T @ EARTH + BIAS * rng.standard_normal(3), up_of(R, 5e-3)
     a = compass_orientation(up, y, EARTH, BIAS)
-    b = compass_orientation(UpDirection(S.T @ up.direction, GRAVITY, 5e-3, 100, 0), S.T @ y, EARTH,
+    b = compass_orientation(UpDirection(S.T @ up.direction, 5e-3), S.T @ y, EARTH,
                             BIAS)
     np.testing.assert_allclose(angles_between(b.R_ws, a.R_ws @ S), 0.0, atol=1e-8)
     np.testing.assert_allclose(b.std, a.std, rtol=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.magnet_pose import locate_magnet
 from mag_tracking.calibration.network_fit import GeometrySettings
 from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network.file import read_network, write_network
@@ -42,7 +42,7 @@ def test_the_written_network_locates_the_magnet(calibrated):
     B = calibrated_readings(network, field[1::2])
     # The fields are equal within the digits of the file, because the background does not drift.
     np.testing.assert_allclose(B, signal_of(g, field[1::2]), rtol=0, atol=1e-12)
-    poses = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
+    poses = [locate_magnet(network, b, MOMENT, *BOX, 0.01, 1e-7) for b in B]
     assert all(p.converged for p in poses)
     r, u = magnet_poses(g, positions[1::2], axes[1::2])
     position_error = np.linalg.norm([p.position for p in poses] - r, axis=1)
@@ -215,7 +215,7 @@ def test_unknown_poses_are_estimated(tmp_path, capsys):
     assert network.calibrated[0].by == f'magnet, {n} unknown poses'
     B = calibrated_readings(network, field)
     pose = locate_magnet(network, B[0], MOMENT, [-0.08, -0.08, 0.03], [0.2, 0.2, 0.25],
-                         PoseSettings())
+                         0.01, 1e-7)
     assert pose.converged and pose.normalised_cost < 3.0
 
 

@@ -14,6 +14,7 @@ from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.published_pose import VehicleOrientation, published_track
 from support import plain_kalman
 from support.networks import line_network
+from support.process_noise import predicted
 
 
 def bank(n=4, spread=10.0, label=None):
@@ -181,10 +182,10 @@ def matched_run(rng, network, model, sigma):
     C = np.repeat(sigma**2 * np.eye(3)[None], len(network), axis=0)
     for k in range(22):
         if k:
-            moved, F, Q = model.propagate(truth[None, :n_t], dt)
+            moved, F, Q = predicted(model, truth[None, :n_t], dt)
             truth[:n_t] = moved[0] + rng.multivariate_normal(np.zeros(n_t), Q[0])
             truth[n_t:] += 1e-9 * np.sqrt(dt) * rng.standard_normal(n_x - n_t)
-            x_target, F, Q = model.propagate(bank.x[:, :n_t], dt)
+            x_target, F, Q = predicted(model, bank.x[:, :n_t], dt)
             plain_kalman.predict(bank.x, bank.P, x_target, F, Q, 1e-18 * dt)
         h = sensor_fields(network.positions, network.R_sw, *model.dipoles(truth[None, :n_t]))[0][0]
         y = h + truth[n_t:].reshape(-1, 3) + sigma * rng.standard_normal(h.shape)

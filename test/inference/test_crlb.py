@@ -9,7 +9,6 @@ from mag_tracking.inference.crlb import (
     bound,
     cpa_information,
     information,
-    marginal,
     observability,
     path_bound,
     snr,
@@ -156,8 +155,6 @@ def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
     J = A.T @ A
     unobservable = n != 0.0
     assert np.array_equal(np.isinf(np.diag(bound(J))), unobservable)
-    for i in range(6):
-        assert np.isinf(bound(marginal(J, [i]))[0, 0]) == unobservable[i]
     # One state has no information, and the units differ by many decades.
     np.testing.assert_allclose(bound(np.diag([4.0, 0.0, 1e16])), [
         [0.25, np.nan, 0.0], [np.nan, np.inf, np.nan], [0.0, np.nan, 1e-16]], rtol=1e-12)
@@ -187,28 +184,6 @@ def test_exactly_known_states_have_zero_variance():
     expected[free] = np.linalg.inv(J[free])
     prior = np.diag([np.inf, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(bound(J, prior), expected, rtol=1e-8, atol=1e-10)
-
-
-def test_marginal_information_is_the_schur_complement():
-    J, keep = (information(car_jacobian(ROAD), CORRELATED) * np.outer(CAR_SCALE, CAR_SCALE),
-               [5, 0, 1])
-    found, rest = marginal(J, keep), np.setdiff1d(np.arange(15), keep)
-    block = np.linalg.inv(J)[np.ix_(keep, keep)]
-    np.testing.assert_allclose(found @ block, np.eye(3), atol=1e-8)
-    mixed = J[np.ix_(keep, rest)]
-    schur = J[np.ix_(keep, keep)] - mixed @ np.linalg.inv(J[np.ix_(rest, rest)]) @ mixed.T
-    np.testing.assert_allclose(found, schur, rtol=1e-6)
-    np.testing.assert_array_equal(marginal(J, np.arange(15) < 6), marginal(J, range(6)))
-
-
-@pytest.mark.parametrize('keep', [[0], [2], [2, 0], [0, 1, 2], [3, 4, 5], [6, 7, 8], range(9)])
-@pytest.mark.parametrize('m', [ONES, UP])
-def test_unobservable_states_stay_unobservable_in_marginal_information(m, keep):
-    """Rounding errors must not turn an infinite bound into a large finite bound."""
-    J, keep = example_information(m, ONE), np.array(keep)
-    expected, found = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
-    assert np.array_equal(np.isinf(np.diag(found)), np.isinf(np.diag(expected)))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
 
 
 def plain_kalman(F, Q, H, C, P):
@@ -334,16 +309,7 @@ H9, I9, SKEW = np.ones((4, 3, 9)), np.eye(9), np.eye(3) + 0.5 * np.eye(3, k=1)
     (lambda: information(H9, 1e-16 * SKEW), r'C\[0\] .*symmetric'),
     (lambda: information(np.where(np.arange(9) == 4, np.nan, H9)), r'H \[0, 0\]'),
     (lambda: observability(np.ones((9, 8)), NAMES), r'information .*\(9, 8\)'),
-    (lambda: observability(I9, NAMES[:8]), 'names .*9 states'),
-    (lambda: observability(I9, NAMES, np.zeros(9)), 'positive scales.*0.0'),
     (lambda: bound(I9, -2.0 * I9), 'prior .*-2.0'),
-    (lambda: marginal(I9, [9]), 'keep .*9'),
-    (lambda: marginal(I9, [1, 1]), r'twice: \[1, 1\]'),
-    (lambda: cpa_information(R0, V0, 0.0), 'std .*0.0'),
-    (lambda: cpa_information(R0, [0.0, 0.0, 0.0], 1.0), 'v0 non-zero'),
-    (lambda: cpa_information(R0[:2], V0, 1.0), r'shape \(3,\), got \(2,\)'),
-    (lambda: cpa_information([-6.0, 2.0, 0.4], [3.0, -1.0, -0.2], 1.0), r'\[-6.0, .* is parallel'),
-    (lambda: path_bound(I9, 0 * I9, H9[0], None, I9), r'steps, got \(3, 9\)'),
     (lambda: path_bound(I9, -I9, H9, None, I9), r'Q\[0\] '),
     (lambda: path_bound(I9, 0 * I9, H9, None, -I9), 'P0 '),
 ])

@@ -5,7 +5,6 @@ import pytest
 
 from mag_tracking.inference.driving_direction import (
     FieldRotation,
-    expected_rotation,
     field_rotation,
     fused_log_odds,
     lag_of,
@@ -25,6 +24,16 @@ def signal(distance=1.0, direction=1.0, n=N):
 def noise_for(h, snr_db):
     """Noise standard deviation for a signal-to-noise ratio; PHD15 Paper B eq. (40)."""
     return float(np.sqrt(np.mean(np.sum(h**2, axis=1)) * 10.0**(-snr_db / 10.0)))
+
+
+def expected_rotation(signal, noise_std, lag):
+    """Mean and variance of `field_rotation` for a noise-free field (n, 2) [T] that is zero outside
+    the window; PHD15 Paper B eq. (12), (14)."""
+    padded = np.pad(signal, ((lag, lag), (0, 0)))
+    differences = np.sum(np.square(padded[2 * lag:] - padded[:-2 * lag]))
+    return FieldRotation(field_rotation(padded, noise_std, lag).correlation,
+                         noise_std**2 / lag**2 * differences
+                         + 2.0 * len(signal) / lag**2 * noise_std**4)
 
 
 def test_expected_rotation_equals_the_published_simulation():

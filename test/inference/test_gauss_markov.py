@@ -132,8 +132,3 @@ def test_components_of_zero_strength_are_constant():
         log_w -= expected
         assert bank.log_density(np.zeros(2, dtype=np.int64), H, y, np.full(2, 0.04), 0.1) \
             == pytest.approx(expected, rel=1e-8)
-
-
-def test_constant_components_must_come_last():
-    with pytest.raises(ValueError, match='come last'):
-        GaussMarkovVectors(1, np.array([0.0, 1.0]), 1.0)

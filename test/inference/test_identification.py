@@ -93,7 +93,7 @@ def test_a_vehicle_enrolled_at_one_heading_is_compared_only_at_this_heading():
     found = identify([vehicle], moment_at(HARD, np.pi / 2), C[0], np.pi / 2, 0.02, H)
     assert found.name == 'van' and found.probabilities == {'van': 1.0}
     found = identify([vehicle], moment_at(HARD, 0.0), C[0], 0.0, 0.02, H)
-    assert found.name == UNKNOWN and found.not_compared == ('van',)
+    assert found.name == UNKNOWN and not found.probabilities
 
 
 def test_a_vehicle_not_enrolled_is_unknown():

@@ -13,7 +13,7 @@ from mag_tracking.geometry import (
     rotation_from_quaternion,
 )
 from mag_tracking.network import CalibrationRecord, SensorNetwork
-from mag_tracking.network.file import Site, earth_field, read_network, write_network
+from mag_tracking.network.file import earth_field, read_network, write_network
 from mag_tracking.network.sensor_network import MAX_SENSORS
 
 VALID_FILE = '''
@@ -104,7 +104,7 @@ def test_the_calibration_of_a_sensor_is_read(tmp_path):
 def test_the_site_determines_the_earth_field(tmp_path):
     n = parse(tmp_path, CALIBRATED_FILE)
     np.testing.assert_array_equal(
-        n.earth_field, earth_field(Site(58.4, 15.6, 60.0, 2026.0 + 120 / 365, 90.0)))
+        n.earth_field, earth_field(58.4, 15.6, 60.0, 2026.0 + 120 / 365, 90.0))
 
 
 def assert_equal_networks(a, b):

@@ -1,9 +1,12 @@
 """Background that accepts individual readings, as in the calibration stage."""
 
+from functools import partial
+
 import numpy as np
 
 from mag_tracking.calibration import core
 from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.sensor_state import new_sensors
 
 
@@ -12,6 +15,7 @@ class FedBackground(RunningBackground):
 
     def __init__(self, *arguments, **named):
         self.sensors = new_sensors(1)
+        named.setdefault('evaluate_change', partial(SharedChanges().evaluate_change, 0))
         super().__init__(*arguments, **named, sensors=self.sensors)
 
     def add(self, time, field):

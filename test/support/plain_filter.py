@@ -5,6 +5,7 @@ import numpy as np
 from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from support import plain_kalman
 from support.plain_smoother import Step, smoothed_covariances, smoothed_states
+from support.process_noise import predicted
 
 
 class StepByStep:
@@ -60,13 +61,13 @@ class PlainFilter(StepByStep, BankFilter):
         self.model = model
 
     def _propagate(self, x, dt, P):
-        """Propagate all targets by `SourceModel.propagate`, one after the other."""
+        """Propagate all targets, one after the other."""
         n, n_one = self.observation.n_target, self.observation.n_one
         moved, F, Q = np.empty_like(x), np.zeros((len(x), n, n)), np.zeros((len(x), n, n))
         for first in range(0, n, n_one):
             own = slice(first, first + n_one)
-            moved[:, own], F[:, own, own], Q[:, own, own] = self.model.propagate(
-                x[:, own], dt, P[:, own, own])
+            moved[:, own], F[:, own, own], Q[:, own, own] = predicted(
+                self.model, x[:, own], dt, P[:, own, own])
         return moved, F, Q
 
     def predict(self, bank, dt, x_lin=None):

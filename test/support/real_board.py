@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.magnet_pose import locate_magnet
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.pose_table import read_pose_table, read_sensor_positions
 from support.bundled import DATA
@@ -29,7 +29,7 @@ def errors(geometry, field, positions, axes, to_world):
     The function `to_world` transforms positions and axes from the tracker frame to the world frame.
     """
     r, u = to_world(positions, axes)
-    estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
+    estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, 0.01, 1e-7)
                  for B in signal_of(geometry, field)]
     assert all(p.converged for p in estimates)
     angle = [np.rad2deg(np.arccos(np.clip(p.axis @ a, -1.0, 1.0)))

@@ -132,7 +132,7 @@ class Observation:
         steps = np.round(time_offset / TIME_RESOLUTION_S)
         for step in np.unique(steps):
             j = np.flatnonzero(steps == step)
-            moved, F, _ = self._model.propagate(x, step * TIME_RESOLUTION_S)
+            moved, F = self._model.propagate(x, step * TIME_RESOLUTION_S)
             h[:, j], H_moved, gradient[:, j] = sensor_fields(
                 self.positions[j], self.R_sw[j], *self._model.dipoles(moved))
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])

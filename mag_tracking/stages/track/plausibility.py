@@ -165,7 +165,8 @@ class Approach:
         if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
             return False
         std = LEVEL_TIME_STD * float(np.median(np.diff(time)))
-        return bool(np.log2((growth.early + std) / (growth.late + std)) < MIN_LOG2_RATIO)
+        early, late = growth.reshape(2, 2).sum(axis=1)
+        return bool(np.log2((early + std) / (late + std)) < MIN_LOG2_RATIO)
 
 
 def typical_speed(settings: TrackSettings) -> float:
