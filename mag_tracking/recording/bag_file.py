@@ -15,12 +15,7 @@ import lz4.frame
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.encodings import cdr_of_ros1
 from mag_tracking.messages.types import RawMessage, schema_of
-from mag_tracking.recording.expansion import (
-    DECODE_ERRORS,
-    RefusedDataError,
-    expanded,
-    largest_chunk,
-)
+from mag_tracking.recording import expansion
 from mag_tracking.recording.message_block import MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
@@ -127,11 +122,12 @@ class BagFile(RecordingFile):
     def _ros1_messages(self, reader: 'Ros1Reader', start_ns: int | None
                        ) -> Iterator[tuple[str, str, int, bytes]]:
         """Iterate over the messages, except those in damaged chunks."""
-        limit = largest_chunk()
+        limit = expansion.largest_chunk()
         # The library trusts the sizes in the file.
         reader.chunks = {position: chunk._replace(
-            datasize=min(chunk.datasize, limit + 1), decompressor=partial(
-                expanded, _ROS1_COMPRESSIONS.get(chunk.decompressor, 'none'), limit=limit))
+            datasize=min(chunk.datasize, limit + 1),
+            decompressor=partial(expansion.expanded, _ROS1_COMPRESSIONS.get(
+                chunk.decompressor, 'none'), limit=limit))
             for position, chunk in reader.chunks.items()}
         order: list[tuple[int, IndexData]] = []
         while True:
@@ -150,7 +146,7 @@ class BagFile(RecordingFile):
                 if n >= len(order):
                     return
                 damaged = order[n][1].chunk_pos
-                reason = f', {error}' if isinstance(error, RefusedDataError) else ''
+                reason = f', {error}' if isinstance(error, expansion.RefusedDataError) else ''
                 self._count_loss(damaged, f'damaged chunks ({self._path.name}{reason})')
             order = [pair for pair in order[n:] if pair[1].chunk_pos != damaged]
             reader.indexes = {number: [] for number in reader.indexes}
@@ -170,4 +166,4 @@ def bag_errors() -> tuple[type[Exception], ...]:
 
     # Damaged bytes can also trigger assertions of the library.
     return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, AssertionError, IndexError,
-            TypeError, AttributeError, OverflowError, *DECODE_ERRORS)
+            TypeError, AttributeError, OverflowError, *expansion.DECODE_ERRORS)

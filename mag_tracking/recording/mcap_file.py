@@ -21,14 +21,7 @@ from mcap.summary import Summary
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.recording import core
-from mag_tracking.recording.expansion import (
-    DECODE_ERRORS,
-    RefusedDataError,
-    check_size,
-    expanded,
-    largest_chunk,
-)
+from mag_tracking.recording import core, expansion
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
@@ -117,8 +110,8 @@ def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
     """
     is_cut = chunk.end > file_size(stream)
     header = chunk_header(stream, chunk)
-    check_size(min(header.size, file_size(stream) - stream.tell()), limit)
-    data = expanded(header.compression, stream.read(header.size), limit, is_cut)
+    expansion.check_size(min(header.size, file_size(stream) - stream.tell()), limit)
+    data = expansion.expanded(header.compression, stream.read(header.size), limit, is_cut)
     if header.crc and not is_cut and zlib.crc32(data) != header.crc:
         raise ValueError('the CRC of the chunk is wrong')
     return data
@@ -154,7 +147,7 @@ def read_summary(stream: BinaryIO) -> Summary | None:
             _check_crc(stream, start, crc)
         stream.seek(0)
         return make_reader(stream).get_summary()
-    except DECODE_ERRORS:
+    except expansion.DECODE_ERRORS:
         return None
 
 
@@ -188,7 +181,7 @@ class McapFile(RecordingFile):
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
         super().__init__(path, losses)
-        self._limit = largest_chunk()
+        self._limit = expansion.largest_chunk()
         self._channels, self._counts = _Channels(), Counter[int]()
         self._parts: list[_Part] = []
         with open(path, 'rb') as stream:
@@ -268,7 +261,7 @@ class McapFile(RecordingFile):
         """Read a part for the first time; add it if it contains messages."""
         try:
             _, rows = self._read(stream, record)
-        except DECODE_ERRORS as error:
+        except expansion.DECODE_ERRORS as error:
             if record.end <= file_size(stream):
                 self._count_loss(record.begin,
                                  f'damaged chunks ({self._path.name}{_reason(error)})')
@@ -283,7 +276,7 @@ class McapFile(RecordingFile):
         if record.opcode == Opcode.CHUNK:
             data = chunk_content(stream, record, self._limit)
         else:
-            check_size(record.end - record.begin, self._limit)
+            expansion.check_size(record.end - record.begin, self._limit)
             stream.seek(record.begin)
             data = stream.read(record.end - record.begin)
         rows, definitions, end = core.records_of(data, LATEST_NS,
@@ -305,7 +298,7 @@ class McapFile(RecordingFile):
             for part, next_start_ns in zip(parts, [*starts, LATEST_NS + 1], strict=False):
                 try:
                     block = self._block(stream, part.record)
-                except DECODE_ERRORS as error:
+                except expansion.DECODE_ERRORS as error:
                     self._count_lost_part(part, error)
                     block = MessageBlock.of_messages([])
                 if progress:
@@ -350,7 +343,7 @@ def _is_valid(index: Sequence[ChunkIndex], size: int) -> bool:
 
 def _reason(error: Exception) -> str:
     """Format why an intact chunk is not read; empty for a damaged chunk."""
-    return f', {error}' if isinstance(error, RefusedDataError) else ''
+    return f', {error}' if isinstance(error, expansion.RefusedDataError) else ''
 
 
 class _Channels:

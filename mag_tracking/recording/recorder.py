@@ -18,17 +18,8 @@ from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
+from mag_tracking.recording import writer
 from mag_tracking.recording.repair import finish_file
-from mag_tracking.recording.writer import (
-    FileSummary,
-    McapFileWriter,
-    Opener,
-    Topic,
-    check_no_recording,
-    offered_qos,
-    open_locked,
-    write_metadata,
-)
 
 FLUSH_INTERVAL_NS = 400_000_000
 """Interval between flushes [ns]. A crash loses the messages of at most one flush interval plus one
@@ -62,7 +53,8 @@ class Recorder:
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
                  split_ns: int = 3600 * 10**9, retry_ns: int = 2 * 10**9,
-                 report: Callable[[str], object] = print, opener: Opener = open_locked) -> None:
+                 report: Callable[[str], object] = print,
+                 opener: writer.Opener = writer.open_locked) -> None:
         self.folder = checked_path(folder, OutputError)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
@@ -70,16 +62,16 @@ class Recorder:
         self.dropped: Counter[str] = Counter()
         self.repeated = 0
         self.unfinished: list[Path] = []
-        self._summaries: list[FileSummary] = []
-        self._topics: dict[str, Topic] = {}
+        self._summaries: list[writer.FileSummary] = []
+        self._topics: dict[str, writer.Topic] = {}
         self._latched: dict[str, deque[_Message]] = {}
         self._sequence: Counter[str] = Counter()
         self._now_ns = self._flushed_ns = self._retry_at_ns = self._metadata_at_ns = \
             self._finished_bytes = 0
-        self._file: McapFileWriter | None = None
+        self._file: writer.McapFileWriter | None = None
         self._opened_ns: int | None = None
         self._is_failing = self._metadata_is_stale = False
-        check_no_recording(self.folder)
+        writer.check_no_recording(self.folder)
         try:
             self._open_next()
         except OSError as error:
@@ -105,7 +97,8 @@ class Recorder:
         of `offered_qos`.
         """
         # All files use the same profile, because readers use it to match channels across files.
-        self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
+        self._topics.setdefault(
+            name, writer.Topic(type_name, definition, qos or writer.offered_qos()))
         if latched:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
@@ -152,7 +145,7 @@ class Recorder:
             self._report(f'the recording {self.folder} could not be completed: free disk space, '
                          f'then run mag-tracking repair {self.folder}')
 
-    def _attempt(self, file: McapFileWriter, action: Callable[..., None], *arguments: object
+    def _attempt(self, file: writer.McapFileWriter, action: Callable[..., None], *arguments: object
                  ) -> bool:
         """Call `action` on the open file; abandon the file on failure. Return True on success."""
         try:
@@ -162,18 +155,18 @@ class Recorder:
             return False
         return True
 
-    def _finish(self, file: McapFileWriter) -> None:
+    def _finish(self, file: writer.McapFileWriter) -> None:
         if self._attempt(file, file.flush) and self._attempt(file, file.finish):
             self._report_recovery()
             self._add_finished(file)
             self._file = None
             self._write_metadata()
 
-    def _add_finished(self, file: McapFileWriter) -> None:
+    def _add_finished(self, file: writer.McapFileWriter) -> None:
         self._summaries.append(file.summary())
         self._finished_bytes += file.size
 
-    def _abandon(self, file: McapFileWriter, error: OSError) -> None:
+    def _abandon(self, file: writer.McapFileWriter, error: OSError) -> None:
         """Close the open file at its last complete chunk, count the lost messages, and schedule a
         retry."""
         self._file = None
@@ -196,7 +189,7 @@ class Recorder:
                          'until writing is possible again')
         self._is_failing = True
 
-    def _reopen(self, log_ns: int) -> McapFileWriter | None:
+    def _reopen(self, log_ns: int) -> writer.McapFileWriter | None:
         """Open a new file with the latched messages; return None if that is not possible yet."""
         if self._is_failing and self._now_ns < self._retry_at_ns:
             return None
@@ -221,7 +214,7 @@ class Recorder:
         self.folder.mkdir(parents=True, exist_ok=True)
         paths = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
                  for n in itertools.count(len(self._summaries)))
-        file = McapFileWriter(next(p for p in paths if not p.exists()), self._opener)
+        file = writer.McapFileWriter(next(p for p in paths if not p.exists()), self._opener)
         try:
             file.start()
             for name, messages in self._latched.items():
@@ -240,7 +233,7 @@ class Recorder:
         """Update `metadata.yaml`, or schedule a retry."""
         files = self._summaries + ([self._file.summary()] if self._file else [])
         try:
-            write_metadata(self.folder, files, self._topics, self._opener)
+            writer.write_metadata(self.folder, files, self._topics, self._opener)
             self._metadata_is_stale = False
         except OSError:
             # Messages have priority: recording continues without up-to-date metadata.

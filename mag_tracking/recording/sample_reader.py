@@ -12,15 +12,9 @@ import numpy as np
 from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages import schema
 from mag_tracking.messages.encodings import UNDECODABLE
 from mag_tracking.messages.message_arrays import magnetic_fields
-from mag_tracking.messages.schema import (
-    MagneticField,
-    acceleration_of,
-    reading_of,
-    readings_of,
-    stamp_ns,
-)
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
@@ -92,9 +86,9 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
         except (RecordingError, AttributeError):
             faults[fault_of(message)] += 1
             continue
-        n_zero[message.topic] += stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
+        n_zero[message.topic] += schema.stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
         n_read[message.topic] += 1
-        latest_ns[message.topic] = max(latest_ns[message.topic], stamp_ns(header.stamp))
+        latest_ns[message.topic] = max(latest_ns[message.topic], schema.stamp_ns(header.stamp))
         frames.setdefault(message.topic, set()).add(header.frame_id)
     if faults and not n_read:
         (cause, _), = faults.most_common(1)
@@ -286,7 +280,7 @@ class SampleReader:
                 if (sensor is not None or is_shared) and message.type != MAGNETIC_FIELD:
                     raise RecordingError(f'{message.topic} carries {message.type}')
                 content = decode(message)
-                readings = readings_of(content) if is_batch else None
+                readings = schema.readings_of(content) if is_batch else None
             except RecordingError:
                 self.rejected[fault_of(message)] += 1
                 continue
@@ -298,7 +292,7 @@ class SampleReader:
                 yield readings, message.log_time_ns
             elif imu_sensors is not None:
                 for name in imu_sensors:
-                    yield acceleration_of(content, name), message.log_time_ns
+                    yield schema.acceleration_of(content, name), message.log_time_ns
             elif sensor is not None or is_shared:
                 frame = content.header.frame_id
                 if not is_shared:
@@ -306,11 +300,11 @@ class SampleReader:
                 yield from self._single(content, frame if sensor is None or is_shared else sensor,
                                         message)
 
-    def _single(self, content: MagneticField, sensor: str, message: RawMessage
+    def _single(self, content: schema.MagneticField, sensor: str, message: RawMessage
                 ) -> Iterator[tuple[Readings, int]]:
         """Convert a decoded message unless its sensor is not in the network or its time is
         missing."""
-        reading = self._network_readings(reading_of(content, sensor))
+        reading = self._network_readings(schema.reading_of(content, sensor))
         if not reading.stamp_ns.all():
             cause = f'{ZERO_STAMP} on {message.topic}'
             if message.topic in self._found.unstamped:

@@ -25,6 +25,7 @@ from typing import Any
 
 from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
+from mag_tracking.results import parquet_table
 from mag_tracking.results.columns import (
     FIT_STATE,
     FITS,
@@ -34,13 +35,6 @@ from mag_tracking.results.columns import (
     axes,
     columns_of,
     pick,
-)
-from mag_tracking.results.parquet_table import (
-    VERSION,
-    TableWriter,
-    check_row,
-    import_pyarrow,
-    is_complete,
 )
 from mag_tracking.units import NS
 
@@ -155,12 +149,12 @@ class ArchiveFolder:
                               'folder')
         self._lock = self._acquire_lock()
         try:
-            self._check_head({'schema': VERSION, **head})
+            self._check_head({'schema': parquet_table.VERSION, **head})
             for name in (_DONE, _WORK):
                 output_folder(self.path / name)
             # One pass over all tables takes less time than a search for those of each recording.
             self._damaged = {table.stem: table for table in self.path.glob('*/date=*/*.parquet')
-                             if not is_complete(table)}
+                             if not parquet_table.is_complete(table)}
         except OSError as error:
             self.close()
             raise OutputError(f'cannot read {self.path}: {error.strerror}') from error
@@ -202,9 +196,10 @@ class ArchiveFolder:
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
             return
         previous_head = _read_json(path)
-        if previous_head.get('schema') != VERSION:
+        if previous_head.get('schema') != parquet_table.VERSION:
             raise OutputError(f'{self.path} has tables of version {previous_head.get("schema")}; '
-                              f'this program writes version {VERSION}. Choose another folder')
+                              f'this program writes version {parquet_table.VERSION}. Choose '
+                              'another folder')
         differing_keys = sorted(key for key in {*head, *previous_head}
                                 if json.dumps(head.get(key), sort_keys=True)
                                 != json.dumps(previous_head.get(key), sort_keys=True))
@@ -231,7 +226,8 @@ class ArchiveFolder:
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
         """Remove outdated results of a recording, and create the folder for its partial results."""
         name, work = recording_key(recording), self.path / _WORK
-        folder = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
+        identity = json.dumps([parquet_table.VERSION, version(_PACKAGE), state])
+        folder = work / f'{name}.{_hash(identity)}'
         try:
             (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
             for path in self.path.glob(f'*/date=*/{glob.escape(name)}.parquet'):
@@ -254,7 +250,8 @@ class ArchiveFolder:
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Write the table `recordings` atomically."""
-        with TableWriter(self.path / 'recordings.parquet', TABLES['recordings']) as table:
+        path = self.path / 'recordings.parquet'
+        with parquet_table.TableWriter(path, TABLES['recordings']) as table:
             for row in rows:
                 table.add(row)
 
@@ -282,10 +279,10 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
 
     Each of `shifts` is added to the column `track_id` of its part (chronological).
     """
-    pa = import_pyarrow()
+    pa = parquet_table.import_pyarrow()
     n, day_ns = 0, pa.scalar(86_400 * NS)
     with ExitStack() as files:
-        days: dict[int, TableWriter] = {}
+        days: dict[int, parquet_table.TableWriter] = {}
         for path, shift in zip(parts, shifts, strict=True):
             rows = pa.parquet.read_table(path)
             n += len(rows)
@@ -297,7 +294,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
             for day in sorted(pa.compute.unique(days_of_rows).to_pylist()):
                 if day not in days:
                     date = datetime.date(1970, 1, 1) + datetime.timedelta(days=day)
-                    days[day] = files.enter_context(TableWriter(
+                    days[day] = files.enter_context(parquet_table.TableWriter(
                         folder / table / f'date={date}' / f'{name}.parquet', TABLES[table]))
                 days[day].add_table(rows.filter(pa.compute.equal(days_of_rows, day)))
     return n
@@ -312,7 +309,7 @@ def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
 def _read_summary(path: Path) -> dict[str, Any]:
     summary = _read_json(path)
     try:
-        check_row(summary, TABLES['recordings'])
+        parquet_table.check_row(summary, TABLES['recordings'])
         if summary['size'] is None:
             raise ValueError('size is missing')
     except ValueError as error:

@@ -10,16 +10,7 @@ from functools import reduce
 from operator import xor
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from mag_tracking.drivers.framings.fields import (
-    AXES,
-    SKIP,
-    FieldLayout,
-    Rejected,
-    axis_value,
-    check_choice,
-    ignore_value,
-    ticks_value,
-)
+from mag_tracking.drivers.framings import fields
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
@@ -127,25 +118,26 @@ class BinaryFraming:
         if not self._sync:
             raise SettingsError('sync: at least one byte is required, such as A5')
         self._tail = _parse_bytes('tail', settings.tail)
-        self._order: _ByteOrder = check_choice('byte_order', settings.byte_order, ('little', 'big'))
-        name = check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
+        self._order: _ByteOrder = fields.check_choice(
+            'byte_order', settings.byte_order, ('little', 'big'))
+        name = fields.check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
         self._checksum = CHECKSUMS.get(name, Checksum(0, lambda data: 0))
-        first_part = check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
-        fields, each = (_parse_fields('fields', settings.fields),
-                        _parse_fields('each', settings.each))
-        self._layout = FieldLayout([name for name, _ in fields], [name for name, _ in each],
-                                   settings.count)
-        types = [kind for _, kind in fields + each * settings.count]
+        first = fields.check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
+        frame, each = (_parse_fields('fields', settings.fields),
+                       _parse_fields('each', settings.each))
+        self._layout = fields.FieldLayout([name for name, _ in frame], [name for name, _ in each],
+                                          settings.count)
+        types = [kind for _, kind in frame + each * settings.count]
         self._struct = struct.Struct(
             '<>'[self._order == 'big'] + ''.join(_STRUCT_CODES[kind] for kind in types))
         self._converters = [_converter(quantity, kind, self._order) for quantity, kind
                             in zip(self._layout.quantities, types, strict=True)]
         self._payload_start = len(self._sync)
-        self._coverage_start = 0 if first_part == 'sync' else self._payload_start
+        self._coverage_start = 0 if first == 'sync' else self._payload_start
         self._payload_end = self._payload_start + self._struct.size
         self._checksum_end = self._payload_end + self._checksum.size
         self.size = self._checksum_end + len(self._tail)
-        kinds = dict(fields)
+        kinds = dict(frame)
         self.CLOCK: dict[str, float] = {'wrap': _wrap(kinds['ticks'])} if 'ticks' in kinds else {}
         self.DRIVER: dict[str, int] = (
             {'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
@@ -167,7 +159,7 @@ class BinaryFraming:
             if not cause:
                 try:
                     readings += self._read(data, start)
-                except Rejected as error:
+                except fields.Rejected as error:
                     cause = str(error)
             if cause:
                 rejected[f'frames {cause}'] += 1
@@ -214,10 +206,10 @@ def _parse_bytes(setting: str, text: str) -> bytes:
             f'{setting}: {text!r} is not hexadecimal; expected bytes such as A5 5A') from None
 
 
-def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
+def _parse_fields(setting: str, texts: Sequence[str]) -> list[tuple[str, str]]:
     """Parse fields such as x:i16 into [(name, type)]."""
     out = []
-    for text in fields:
+    for text in texts:
         name, _, kind = text.rpartition(':')
         if kind not in _STRUCT_CODES:
             raise SettingsError(f'{setting}: {text!r}: expected a name with one of the types '
@@ -236,11 +228,12 @@ def _wrap(kind: str) -> int:
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
     """Return the function that converts unpacked values of a quantity for `FieldLayout`."""
-    if quantity == SKIP:
-        return ignore_value
+    if quantity == fields.SKIP:
+        return fields.ignore_value
     convert: _Converter
-    if quantity in AXES or quantity == 'ticks':
-        convert = float if kind[0] != 'f' else axis_value if quantity in AXES else ticks_value
+    if quantity in fields.AXES or quantity == 'ticks':
+        checked = fields.axis_value if quantity in fields.AXES else fields.ticks_value
+        convert = checked if kind[0] == 'f' else float
     else:
         convert = str if quantity == 'sensor' else int
     if not kind.endswith('24'):
