@@ -97,7 +97,6 @@ def write_json(path: str | PathLike[str], value: Any) -> None:
 
 
 def _without_nan(value: Any) -> Any:
-    """Replace NaN and infinity by None in a copy of nested dicts and lists; tuples become lists."""
     if isinstance(value, dict):
         return {k: _without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -186,7 +185,6 @@ def _check_size(root: yaml.Node) -> None:
 
 
 def _children(node: yaml.Node) -> list[yaml.Node]:
-    """Child nodes of a node, including keys."""
     if isinstance(node, yaml.MappingNode):
         return [child for pair in node.value for child in pair]
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []

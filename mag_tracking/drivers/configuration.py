@@ -112,7 +112,6 @@ def driver_of(name: object, entry: object) -> Driver:
 
 
 def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
-    """Create the device of an entry; remove its settings from `options`."""
     if 'device' in options:
         if 'transport' in options or 'framing' in options:
             raise SettingsError('device cannot be combined with transport or framing; remove '
@@ -199,7 +198,6 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
 
 
 def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> None:
-    """Raise SettingsError if a sensor is assigned twice, or is not in the network."""
     owner: dict[str, str] = {}
     for driver in drivers:
         for key, sensor in driver.sensors.items():
@@ -215,7 +213,6 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
 
 
 def _names(settings: Any) -> set[str]:
-    """Names of the settings and groups of a settings dataclass."""
     return {field.name for field in dataclasses.fields(settings)}
 
 
@@ -227,7 +224,6 @@ def _groups_of(name: object) -> list[str]:
 
 
 def _joined(groups: Collection[str]) -> str:
-    """Join names for a message, such as 'serial, udp or mqtt'."""
     *others, last = groups
     return f'{", ".join(others)} or {last}' if others else last
 

@@ -185,7 +185,6 @@ class _StandingClock:
 
 
 def _advice(ticks: float, tick_ns: float) -> str:
-    """What to change for a device time that is not plausible."""
     unit = unit_since_1970(ticks)
     if isinstance(ticks, DeviceDate) or unit and TIME_UNITS[unit] == tick_ns:
         return f'{ticks:.15g}: send decimals of the second, or set stamp_by: arrival'
@@ -286,7 +285,6 @@ class DeviceClock:
             t, elapsed - t, detrended, arrival_ns)
 
     def _count(self, cause: str, ticks: float) -> None:
-        """Count a reading, and store the first one as an example."""
         if cause not in self.examples:
             self.examples = {**self.examples, cause: _advice(ticks, self._tick_ns)}
         self.counts[cause] += 1

@@ -171,7 +171,6 @@ class Driver:
         self._schedule_retry(f'{type(error).__name__}: {error}')
 
     def _try_to_open(self, timeout_s: float) -> bool:
-        """Open the device if the retry interval has elapsed; return whether it is open."""
         if self._retry_ns is not None:
             wait_s = (self._retry_ns - self._monotonic_ns()) / 1e9
             if wait_s > 0.0:
@@ -208,7 +207,6 @@ class Driver:
         return offset
 
     def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> PollResult:
-        """Convert arrivals to samples."""
         sensors: list[str] = []
         stamps: list[int] = []
         fields: list[Axes] = []
@@ -260,7 +258,6 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, reported_name: str, source: str) -> str | None:
-        """Network name of a sensor; None if ignored or unknown."""
         sensor = next((self.sensors[name] for name in (reported_name, source)
                        if name and name in self.sensors), self.sensors.get(''))
         if sensor is None:
@@ -302,7 +299,6 @@ class Driver:
         return self._measured_ns
 
     def _drop_clocks(self) -> None:
-        """Drop the clocks of sources that are no longer selected; keep their counts."""
         selected = {claim.selected[1] for claim in self._claims.values() if claim.selected}
         for source in self._clocks.keys() - selected:
             clock = self._clocks.pop(source)

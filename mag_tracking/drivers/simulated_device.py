@@ -108,7 +108,6 @@ class SimulatedDevice:
 
     @property
     def _period_s(self) -> float:
-        """Interval between vehicles [s]."""
         return max(self._settings.period_s, self._passing_s)
 
     def _elapsed(self) -> float:

@@ -128,7 +128,6 @@ def _part(message: Any, name: str) -> Any:
 
 
 def _field(message: Any) -> MessageDict:
-    """Convert a message to sensor_msgs/MagneticField; raises ValueError for an invalid message."""
     field = _part(message, 'magnetic_field')
     if field is None:
         raise MissingPartError('magnetic_field')
@@ -153,7 +152,6 @@ def _number(value: Any) -> Any:
 
 
 def _time(stamp: Any) -> dict[str, int]:
-    """Convert a time to builtin_interfaces/Time; raises ValueError if it is not valid."""
     stamp = _number(stamp)
     if isinstance(stamp, str):
         raise MissingPartError('sec in its time, which is text')

@@ -108,7 +108,6 @@ def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
 
 
 def _smallest_distance(positions: FloatArray) -> float:
-    """Smallest distance [m] between two sensors; infinite for a single sensor."""
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return float(distances.min())

@@ -153,7 +153,6 @@ class RawMessage(NamedTuple):
 
 
 def _full_name(kind: str, package: str) -> str:
-    """Full name of the type that is called `kind` in a definition of `package`."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
@@ -176,7 +175,6 @@ def _dependencies(type_name: str) -> list[str]:
 
 
 def _own_definition(type_name: str) -> str:
-    """Definition of a type; raises RecordingError if it is unknown."""
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
     return DEFINITIONS[type_name]

@@ -58,7 +58,6 @@ class BagFile(RecordingFile):
                 self.start_ns, self.end_ns = time_range.start_time, time_range.end_time - 1
 
     def _open_reader(self) -> AbstractContextManager[Any]:
-        """Open the bag with the reader of `rosbags`; raises RecordingError."""
         # Imported here because most recordings are MCAP and do not need the library.
         from rosbags.rosbag1 import Reader
         from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader

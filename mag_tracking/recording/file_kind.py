@@ -12,8 +12,6 @@ _TO_CSV = f'No command reads it: write the field and its time to a CSV file, {_I
 
 
 class _Kind(NamedTuple):
-    """Kind of a file."""
-
     description: str
     advice: str
     magic: bytes = b''
@@ -91,7 +89,6 @@ def binary_kind(path: Path) -> str:
 
 
 def _kind_of(path: Path) -> _Kind:
-    """Recognise a file by its first bytes."""
     with open(path, 'rb') as stream:
         head = stream.read(HEAD_SIZE)
     for kind in _BINARY:
@@ -113,7 +110,6 @@ def _kind_of(path: Path) -> _Kind:
 
 
 def _kind_of_zip(path: Path) -> _Kind:
-    """Recognise a ZIP archive by the names in it."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

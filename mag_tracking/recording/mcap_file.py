@@ -326,7 +326,6 @@ class McapFile(RecordingFile):
         return MessageBlock.of_rows(data, self._channels.kinds, rows)
 
     def _count_lost_part(self, part: _Part, error: Exception) -> None:
-        """Count an unreadable chunk as a loss, described by its duration and start time."""
         duration_s = (part.end_ns - part.start_ns) / 1e9
         start_s = (part.start_ns - (self.start_ns or part.start_ns)) / 1e9
         self._count_loss(part.record.begin, f'damaged segments ({self._path.name}, '

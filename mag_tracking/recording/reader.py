@@ -136,7 +136,6 @@ def _listed_file(file: Path) -> Path:
 
 
 def _open(file: Path, losses: 'Counter[str]') -> McapFile | BagFile:
-    """Open a file with the reader of its content; raises RecordingError."""
     try:
         with open(file, 'rb') as stream:
             head = stream.read(HEAD_SIZE)

@@ -230,7 +230,6 @@ class Recorder:
         self._write_metadata()
 
     def _write_metadata(self) -> None:
-        """Update `metadata.yaml`, or schedule a retry."""
         files = self._summaries + ([self._file.summary()] if self._file else [])
         try:
             writer.write_metadata(self.folder, files, self._topics, self._opener)

@@ -175,7 +175,6 @@ class SampleReader:
         self._shared = self._found.shared(network.names)
 
     def _examine_topics(self, network: SensorNetwork) -> TopicFindings:
-        """Check the types and the first messages of the topics."""
         types = self._recording.types
         topics = [topic for topic in self._sensors if topic in types]
         for topic in topics:
@@ -243,7 +242,6 @@ class SampleReader:
         return Readings.joined([*parts, batch.part(slice(n_added, None))])
 
     def _check_frames(self, block: MessageBlock, rows: IntArray, frames: IntArray) -> None:
-        """Check the frames, numbered (k,), of the messages `rows` (k,) of a block."""
         expected = np.full(max(block.kinds, default=0) + 1, -1, dtype=np.int64)
         for number, kind in block.kinds.items():
             expected[number] = self._frames.number(kind.topic)
@@ -329,7 +327,6 @@ class SampleReader:
             self.clocks[readings.names[j]] = earlier.until(span)
 
     def _network_readings(self, readings: Readings) -> Readings:
-        """Select the readings of the network's sensors, and count readings of other sensors."""
         network_sensors = set(self._sensors.values())
         is_known = np.array([name in network_sensors for name in readings.names],
                             dtype=bool)[readings.sensor]
@@ -350,7 +347,6 @@ class SampleReader:
 
 
 def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
-    """Format the topics with magnetic fields and several `frames`, or else all topics."""
     fields = [topic + (f' (with the frame_ids {", ".join(sorted(frames[topic]))})'
                        if len(frames.get(topic, ())) > 1 else '')
               for topic, kind in sorted(types.items()) if kind == MAGNETIC_FIELD]

@@ -235,7 +235,6 @@ def read_model(path: FilePath) -> SignatureModel:
 
 
 def _parse_model(content: Any) -> SignatureModel:
-    """Create a model from the content of its file; a ValueError names the invalid entry."""
     if not isinstance(content, dict):
         raise ValueError('expected a mapping of entries')
     names = [field.name for field in fields(SignatureModel)]
@@ -261,7 +260,6 @@ def _parse_entry(name: str, value: Any) -> Any:
 
 
 def _check_model(model: SignatureModel) -> None:
-    """Raise ValueError if the arrays of a model are inconsistent or not finite."""
     n, k = len(model.mean), len(set(model.classes))
     if k < 2 or k < len(model.classes):
         raise ValueError('classes: expected at least two different names')

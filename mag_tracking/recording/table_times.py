@@ -111,7 +111,6 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
 
 
 def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
-    """Convert dates or times of day."""
     found = order or units.date_order(texts)
     if found is None:
         raise RecordingError(
@@ -186,7 +185,6 @@ def _unit_of(where: str, values: Sequence[int | None], step: int, unit: str, hea
 
 
 def _plausible(step: float, span: float) -> str:
-    """List the units in which the interval of readings is plausible, with rate and span."""
     return ', '.join(
         f'{name} ({_rates(step * ns / units.NS, span * ns / units.NS)})'
         for name, ns in units.TIME_UNITS.items()

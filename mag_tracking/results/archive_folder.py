@@ -163,7 +163,6 @@ class ArchiveFolder:
             raise
 
     def _acquire_lock(self) -> int:
-        """Acquire the exclusive lock and return its file descriptor; raises OutputError."""
         import fcntl
 
         path = self.path / _LOCK
@@ -190,7 +189,6 @@ class ArchiveFolder:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Write `head` to archive.json; raise OutputError if the file has other metadata."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')

@@ -106,7 +106,6 @@ class FitFolder:
 
 
 def _bearing(bearing: Bearing | None) -> dict[str, Any] | None:
-    """Convert a `Bearing` to a dict for JSON; return None if there is no bearing."""
     if bearing is None:
         return None
     return {'to_closest_point': bearing.cpa_direction.tolist(),

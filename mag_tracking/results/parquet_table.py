@@ -87,7 +87,6 @@ class TableWriter:
 
     @contextmanager
     def _convert_errors(self) -> Iterator[None]:
-        """Convert an OSError to an OutputError that names the file."""
         try:
             yield
         except OSError as error:

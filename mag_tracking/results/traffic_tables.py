@@ -38,7 +38,6 @@ def event_row(event: PassEvent) -> list[object]:
 
 
 def _number(value: float) -> str:
-    """Format a number with six significant digits; return '' for NaN and infinity."""
     return f'{value:.6g}' if np.isfinite(value) else ''
 
 
@@ -54,7 +53,6 @@ def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> No
 
 
 def _signature_rows(event: PassEvent) -> Iterator[list[object]]:
-    """Cells of the samples of an event's signature."""
     offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
                                                len(event.signature))
     closest_s = (event.closest_ns - event.onset_ns) / NS
@@ -64,7 +62,6 @@ def _signature_rows(event: PassEvent) -> Iterator[list[object]]:
 
 
 def _write_csv(path: Path, columns: Iterable[Column], rows: Iterable[Iterable[object]]) -> None:
-    """Write a CSV file with the names of the columns; raises OSError."""
     with new_text_file(path, newline='') as stream:
         writer = csv.writer(stream)
         writer.writerow(names_of(columns))

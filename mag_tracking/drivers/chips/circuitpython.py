@@ -108,13 +108,11 @@ class BusioI2c:
         in_buffer[in_start:in_end] = bytes(message)
 
     def _transfer(self, *messages: i2c_msg) -> None:
-        """Make one transaction."""
         self._check_deadline()
         self.addresses.update(message.addr for message in messages)
         self._registers.transfer(*messages)
 
     def _check_deadline(self) -> None:
-        """Raise DeviceError if the deadline has passed."""
         if self._registers.monotonic_ns() > self._deadline_ns:
             raise DeviceError('timeout while the driver waited for its chip')
 
@@ -152,7 +150,6 @@ class CircuitpythonChip(Chip):
                               'correct the address')
 
     def _property_name(self) -> str:
-        """Name of the property that reads the field."""
         # A look at the property of the instance would start a measurement.
         members = {*dir(type(self._driver)), *getattr(self._driver, '__dict__', ())}
         for name in PROPERTIES:
@@ -184,7 +181,6 @@ class CircuitpythonChip(Chip):
 
 
 def _address_argument(cls: Any, address: int) -> dict[str, int]:
-    """Return {parameter named after the address: address}; empty if `cls` has none."""
     names = list(inspect.signature(cls).parameters)[1:]
     candidates = ['address'] * ('address' in names) + [name for name in names if 'addr' in name]
     return dict.fromkeys(candidates[:1], address)

@@ -101,7 +101,6 @@ class Mmc5983ma(chip.Chip):
         return _conversion(middle_ns, (x, y, z))
 
     def _measure_pair(self) -> chip.Measurement:
-        """Measure after SET and after RESET, and store the offset."""
         conversions = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
@@ -154,6 +153,5 @@ class Mmc5603(Mmc5983ma):
 
 
 def _conversion(middle_ns: int, counts: Axes) -> chip.Conversion:
-    """Create a conversion from the time of its middle [ns] and its field [counts]."""
     x, y, z = (c / COUNTS_PER_TESLA for c in counts)
     return chip.Conversion(middle_ns, (x, y, z))

@@ -191,14 +191,12 @@ class BinaryFraming:
         return ''
 
     def _read(self, data: bytes, start: int) -> list[Reading]:
-        """Extract the readings of the frame at `start`; raises Rejected for an invalid value."""
         values = self._struct.unpack_from(data, start + self._payload_start)
         return self._layout.readings(
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
 
 def _parse_bytes(setting: str, text: str) -> bytes:
-    """Parse hexadecimal bytes."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -207,7 +205,6 @@ def _parse_bytes(setting: str, text: str) -> bytes:
 
 
 def _parse_fields(setting: str, texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse fields such as x:i16 into [(name, type)]."""
     out = []
     for text in texts:
         name, _, kind = text.rpartition(':')
@@ -227,7 +224,6 @@ def _wrap(kind: str) -> int:
 
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
-    """Return the function that converts unpacked values of a quantity for `FieldLayout`."""
     if quantity == fields.SKIP:
         return fields.ignore_value
     convert: _Converter

@@ -101,7 +101,6 @@ def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Val
 
 
 def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return `fields`, then `each` for every sensor."""
     for name in fields:
         quantity, sensor = _split(name)
         if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
@@ -121,7 +120,6 @@ def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple
 
 
 def _is_valid_name(name: str) -> bool:
-    """Whether a sensor may have this name."""
     return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 

@@ -97,7 +97,6 @@ class JsonFraming:
         return self._lines.parse(data, final, self._read)
 
     def _is_single_document(self, data: bytes) -> bool:
-        """Whether `data` is a single JSON document that spans several lines."""
         if self._lines.end not in data.strip() or len(data) > self._lines.max_length:
             return False
         try:
@@ -107,7 +106,6 @@ class JsonFraming:
         return True
 
     def _decode_document(self, line: bytes) -> Any:
-        """Decode a JSON document; raises Rejected if it is not valid."""
         try:
             text = line.decode()
             try:
@@ -127,7 +125,6 @@ class JsonFraming:
             raise fields.Rejected('that are not JSON', remedy) from None
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Extract the reading of one object."""
         content = self._decode_document(line)
         if not isinstance(content, dict):
             raise fields.Rejected('that are not a JSON object',
@@ -143,7 +140,6 @@ class JsonFraming:
 
 
 def _strict(match: re.Match[str]) -> str:
-    """Replace a match of `_LOOSE` by JSON."""
     string, quoted, key, constant = match.groups()
     if string:
         return string
@@ -153,7 +149,6 @@ def _strict(match: re.Match[str]) -> str:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Dict of a JSON object, whose keys must differ."""
     content = dict(pairs)
     if len(content) != len(pairs):
         raise fields.Rejected('with a duplicate key')
@@ -169,7 +164,6 @@ def _split_path(name: str, path: str) -> _Keys:
 
 
 def _lookup(value: Any, path: str, keys: _Keys) -> Any:
-    """Value at a path."""
     content = value
     for key, index in keys:
         if isinstance(value, dict) and key in value:
@@ -204,18 +198,15 @@ def _number(value: object, path: str, decimal: str) -> int | float:
 
 
 def _axis(value: object, path: str, decimal: str) -> float:
-    """Convert an axis to float, null to NaN."""
     return float('nan') if value in (None, '') else fields.axis_value(_number(value, path, decimal))
 
 
 def _ticks(value: object, path: str, decimal: str) -> float:
-    """Convert a device time, a number or a date."""
     return fields.text_ticks(value, decimal) if isinstance(value, str) else fields.ticks_value(
         _number(value, path, decimal))
 
 
 def _sequence(value: object, path: str, decimal: str) -> int:
-    """Convert a sequence number, such as 12 or 12.0, to int."""
     value = _number(value, path, decimal)
     if isinstance(value, float):
         if not value.is_integer():
@@ -225,7 +216,6 @@ def _sequence(value: object, path: str, decimal: str) -> int:
 
 
 def _sensor(value: object, path: str, decimal: str) -> str:
-    """Convert a name (string or integer) to str."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):

@@ -134,7 +134,6 @@ class TextFraming:
         self._check_settings(separator)
 
     def _check_settings(self, separator: bytes) -> None:
-        """Raise SettingsError if separator, prefix or comment prefix prevents correct parsing."""
         if not separator or re.search(rb'[0-9A-Za-z+.-]', separator):
             raise SettingsError(f'separator: {separator!r} is empty or can be part of a number')
         if self._lines.end in separator:
@@ -151,7 +150,6 @@ class TextFraming:
         return self._lines.parse(data, final, self._read)
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Extract the readings of one line."""
         if self._comment and line.startswith(self._comment):
             raise fields.Rejected('that are comments')
         if not line.startswith(self._prefix):
@@ -169,7 +167,6 @@ class TextFraming:
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 
     def _width_remedy(self, line: bytes, values: list[bytes]) -> str:
-        """Explain a line with an unexpected number of values."""
         n = len(self._converters)
         for name, separator in (("';'", b';'), ("'\\t'", b'\t'), ("' '", None), ("','", b',')):
             if len(line[len(self._prefix):].split(separator)) == n:
@@ -179,7 +176,6 @@ class TextFraming:
 
 
 def _strip_checksum(line: bytes) -> bytes:
-    """Verify and remove the checksum `*hh`."""
     if line[-3:-2] != b'*':
         raise fields.Rejected('without a checksum')
     line, digits = line[:-3], line[-2:]
@@ -211,14 +207,12 @@ def _axis(text: bytes) -> float:
 
 
 def _ticks(text: bytes, decimal: str) -> float:
-    """Parse a device time, a number or a date."""
     text = text.strip(b' \t"')
     return fields.ticks_value(math.nan) if _MISSING(text) else \
         fields.text_ticks(text.decode(), decimal)
 
 
 def _sequence(text: bytes) -> int:
-    """Parse a sequence number of at most 64 bits."""
     text = text.strip(b' \t"')
     if not _INTEGER(text):
         raise fields.Rejected('with a sequence number that is not an integer')
@@ -226,5 +220,4 @@ def _sequence(text: bytes) -> int:
 
 
 def _sensor(text: bytes) -> str:
-    """Parse the name of a sensor."""
     return fields.sensor_name(text.strip(b' \t"').decode())

@@ -136,7 +136,6 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
 
 
 def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Message from {attribute of `Reading`: value}."""
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
@@ -232,7 +231,6 @@ _REJECT_STEP = _ParseStep(1)
 
 
 def _is_from_device(mid: int) -> bool:
-    """Whether devices send messages of this type."""
     return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
 
 
@@ -256,7 +254,6 @@ def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
 
 
 def _is_checksum_valid(window: bytes, index: int, message: _Message) -> bool:
-    """Whether the sum of all bytes but the preamble is a multiple of 256."""
     return sum(window[index + 1:message.end]) % 256 == 0
 
 
@@ -362,7 +359,6 @@ class XsensFraming:
         return found
 
     def _decode(self, window: bytes, message: _Message) -> DecodedMessage | None:
-        """Decode a data message; None if the message is malformed or of another type."""
         data = window[message.begin:message.end - 1]
         if message.mid == _MTDATA2:
             return read_mtdata2(data)
@@ -371,7 +367,6 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """Cause under which a message without a reading is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:
                 return 'MTData messages, although mtdata is none'

@@ -73,7 +73,6 @@ class _TlsContext(ssl.SSLContext):
     """TLS context with an immediate handshake; a failed handshake closes the socket."""
 
     def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
-        """Wrap a socket in TLS and perform the handshake immediately."""
         return super().wrap_socket(sock, *args, **(kwargs | {'do_handshake_on_connect': True}))
 
 
@@ -126,7 +125,6 @@ class MqttTopics:
                               f'{self.settings.connect_timeout_s:g} s; is it an MQTT broker?')
 
     def _client(self) -> paho.Client:
-        """Create a client."""
         s = self.settings
         client = paho.Client(
             CallbackAPIVersion.VERSION2, s.client_id or f'mag_tracking_{secrets.token_hex(4)}',
@@ -141,7 +139,6 @@ class MqttTopics:
         return client
 
     def _tls_context(self) -> ssl.SSLContext:
-        """TLS context with the trusted CA certificates."""
         path = self.settings.ca_file
         # A context of this type requires a certificate that matches the host name.
         context = _TlsContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -156,7 +153,6 @@ class MqttTopics:
         return context
 
     def _password(self) -> str | None:
-        """Read the password; None if no file is configured."""
         path = self.settings.password_file
         if not path:
             return None
@@ -171,7 +167,6 @@ class MqttTopics:
         return password
 
     def _connect(self, client: paho.Client) -> None:
-        """Connect the client, with TLS if configured."""
         s = self.settings
         try:
             client.connect(s.host, s.port, s.keepalive_s)
@@ -228,7 +223,6 @@ class MqttTopics:
             self._changed.notify_all()
 
     def _on_message(self, client: paho.Client, _: Any, message: paho.MQTTMessage) -> None:
-        """Append a message to the queue, or count the cause of its rejection."""
         arrival_ns = time.monotonic_ns()
         with self._changed:
             if message.dup:
@@ -279,7 +273,6 @@ class MqttTopics:
             return chunks
 
     def _add_thread_counts(self) -> None:
-        """Add the counts of the network thread to `counts`."""
         self.counts += self._thread_counts
         self._thread_counts.clear()
 

@@ -84,7 +84,6 @@ class SerialPort(Polled[serial.Serial]):
                 self._line_errors = None
 
     def _open_error(self, error: Exception) -> str:
-        """Reason why the port cannot be opened, with the remedy."""
         code = getattr(error, 'errno', None)
         if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
             available = ', '.join(f'{p.device} ({p.description})' for p in list_ports.comports())
@@ -118,7 +117,6 @@ class SerialPort(Polled[serial.Serial]):
         return [Chunk(arrival_ns, data)] if data else []
 
     def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
-        """Count the line errors between two states of the kernel's error counters."""
         for i, cause in LINE_ERRORS.items():
             if now[i] != before[i]:
                 self.counts[cause] += (now[i] - before[i]) % 2**32

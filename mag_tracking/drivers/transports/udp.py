@@ -137,7 +137,6 @@ class UdpSocket(Polled[socket.socket]):
         opened.bind((s.group or s.address, s.port))
 
     def _open_error(self, error: OSError) -> str:
-        """Reason why the socket cannot be opened, with the remedy."""
         s = self.settings
         if error.errno == errno.EADDRINUSE:
             return 'the port is in use by another program; choose another port'
@@ -164,7 +163,6 @@ class UdpSocket(Polled[socket.socket]):
         return chunks
 
     def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
-        """Receive the queued datagrams; return the accepted datagrams as chunks."""
         datagrams: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
         is_empty = False
         ancillary_size = socket.CMSG_SPACE(TIMESPEC.size)
@@ -185,7 +183,6 @@ class UdpSocket(Polled[socket.socket]):
                 if self._accept(data, flags, ip)]
 
     def _accept(self, data: bytes, flags: int, ip: str) -> bool:
-        """Return whether a datagram is accepted; count a rejected datagram."""
         if not self._any_source and ip not in self._sources:
             self.counts['datagrams from other sources'] += 1
         elif flags & socket.MSG_TRUNC:
@@ -209,7 +206,6 @@ class UdpSocket(Polled[socket.socket]):
         return woken_ns
 
     def _count_drops(self, opened: socket.socket) -> None:
-        """Count the datagrams that the kernel has dropped since the previous call."""
         drops = MEMINFO.unpack(
             opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS_INDEX]
         if drops != self._drops:
