@@ -37,17 +37,6 @@ class FieldArrays(NamedTuple):
     """(n,) Number of the frame name. Equal names have equal numbers; -1 if not decoded."""
 
 
-class PoseArrays(NamedTuple):
-    """Contents of geometry_msgs/PoseStamped messages as arrays."""
-
-    is_decoded: BoolArray
-    """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
-    CDR, or in another frame. The corresponding elements of the other arrays are invalid."""
-    stamp_ns: IntArray
-    pose: FloatArray
-    """(n, 7) Position [m] and quaternion xyzw."""
-
-
 def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldArrays:
     """Decode sensor_msgs/MagneticField messages, which are `content[begins[i]:ends[i]]` in CDR."""
     stamped = _StampedMessages(content, begins, ends, _FIELD_DOUBLES)
@@ -60,12 +49,17 @@ def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldAr
                        known_covariances(numbers[:, 3:].reshape(-1, 3, 3)), frames)
 
 
-def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseArrays:
-    """Decode geometry_msgs/PoseStamped messages of a frame, `content[begins[i]:ends[i]]` in CDR."""
+def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str
+          ) -> tuple[BoolArray, IntArray, FloatArray]:
+    """Decode geometry_msgs/PoseStamped messages, which are `content[begins[i]:ends[i]]` in CDR.
+
+    Return (whether a message was decoded (n,), as in `FieldArrays`, and not if it is in another
+    frame; its timestamp (n,) [ns]; position [m] and quaternion xyzw (n, 7)).
+    """
     stamped = _StampedMessages(content, begins, ends, _POSE_DOUBLES)
     rows = np.flatnonzero(stamped.is_decoded)
     stamped.is_decoded[rows] = stamped.have_frame(rows, frame)
-    return PoseArrays(stamped.is_decoded, stamped.stamp_ns, stamped.numbers())
+    return stamped.is_decoded, stamped.stamp_ns, stamped.numbers()
 
 
 class _StampedMessages:

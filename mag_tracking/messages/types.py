@@ -23,48 +23,34 @@ MessageDict: TypeAlias = dict[str, Any]
 """Message to be written, as nested dicts of its fields."""
 
 DEFINITIONS: dict[str, str] = {
-    'builtin_interfaces/msg/Duration': (
-        'int32 sec\nuint32 nanosec\n'),
-    'builtin_interfaces/msg/Time': (
-        'int32 sec\nuint32 nanosec\n'),
-    'std_msgs/msg/ColorRGBA': (
-        'float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n'),
-    'std_msgs/msg/Header': (
-        'builtin_interfaces/Time stamp\nstring frame_id\n'),
-    'geometry_msgs/msg/Point': (
-        'float64 x\nfloat64 y\nfloat64 z\n'),
+    'builtin_interfaces/msg/Duration': 'int32 sec\nuint32 nanosec\n',
+    'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec\n',
+    'std_msgs/msg/ColorRGBA': 'float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n',
+    'std_msgs/msg/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',
+    'geometry_msgs/msg/Point': 'float64 x\nfloat64 y\nfloat64 z\n',
     'geometry_msgs/msg/Pose': (
         'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n'),
-    'geometry_msgs/msg/PoseStamped': (
-        'std_msgs/Header header\ngeometry_msgs/Pose pose\n'),
-    'geometry_msgs/msg/PoseWithCovariance': (
-        'geometry_msgs/Pose pose\nfloat64[36] covariance\n'),
+    'geometry_msgs/msg/PoseStamped': 'std_msgs/Header header\ngeometry_msgs/Pose pose\n',
+    'geometry_msgs/msg/PoseWithCovariance': 'geometry_msgs/Pose pose\nfloat64[36] covariance\n',
     'geometry_msgs/msg/PoseWithCovarianceStamped': (
         'std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n'),
-    'geometry_msgs/msg/Quaternion': (
-        'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n'),
+    'geometry_msgs/msg/Quaternion': 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n',
     'geometry_msgs/msg/Transform': (
         'geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n'),
     'geometry_msgs/msg/TransformStamped': (
         'std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n'),
-    'geometry_msgs/msg/Twist': (
-        'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n'),
-    'geometry_msgs/msg/TwistWithCovariance': (
-        'geometry_msgs/Twist twist\nfloat64[36] covariance\n'),
-    'geometry_msgs/msg/Vector3': (
-        'float64 x\nfloat64 y\nfloat64 z\n'),
-    'sensor_msgs/msg/CompressedImage': (
-        'std_msgs/Header header\nstring format\nuint8[] data\n'),
+    'geometry_msgs/msg/Twist': 'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n',
+    'geometry_msgs/msg/TwistWithCovariance': 'geometry_msgs/Twist twist\nfloat64[36] covariance\n',
+    'geometry_msgs/msg/Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
+    'sensor_msgs/msg/CompressedImage': 'std_msgs/Header header\nstring format\nuint8[] data\n',
     'sensor_msgs/msg/MagneticField': (
         'std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n'
         'float64[9] magnetic_field_covariance\n'),
     'nav_msgs/msg/Odometry': (
         'std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n'
         'geometry_msgs/TwistWithCovariance twist\n'),
-    'nav_msgs/msg/Path': (
-        'std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses\n'),
-    'tf2_msgs/msg/TFMessage': (
-        'geometry_msgs/TransformStamped[] transforms\n'),
+    'nav_msgs/msg/Path': 'std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses\n',
+    'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] transforms\n',
     'visualization_msgs/msg/Marker': (
         'int32 ARROW=0\nint32 CUBE=1\nint32 SPHERE=2\nint32 CYLINDER=3\nint32 LINE_STRIP=4\n'
         'int32 LINE_LIST=5\nint32 CUBE_LIST=6\nint32 SPHERE_LIST=7\nint32 POINTS=8\n'
@@ -77,12 +63,9 @@ DEFINITIONS: dict[str, str] = {
         'sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\n'
         'string text\nstring mesh_resource\nvisualization_msgs/MeshFile mesh_file\n'
         'bool mesh_use_embedded_materials\n'),
-    'visualization_msgs/msg/MarkerArray': (
-        'visualization_msgs/Marker[] markers\n'),
-    'visualization_msgs/msg/MeshFile': (
-        'string filename\nuint8[] data\n'),
-    'visualization_msgs/msg/UVCoordinate': (
-        'float32 u\nfloat32 v\n'),
+    'visualization_msgs/msg/MarkerArray': 'visualization_msgs/Marker[] markers\n',
+    'visualization_msgs/msg/MeshFile': 'string filename\nuint8[] data\n',
+    'visualization_msgs/msg/UVCoordinate': 'float32 u\nfloat32 v\n',
     'mag_tracking_msgs/msg/Disturbance': (
         'std_msgs/Header header\nuint32 id\nbool ended\nbuiltin_interfaces/Time begin\n'
         'float64 largest\nstring[] sensors\nfloat64 uniform\nuint32 track_id\n'),

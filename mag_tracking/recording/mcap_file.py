@@ -21,6 +21,7 @@ from mcap.summary import Summary
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.encodings import type_of
 from mag_tracking.recording import core, expansion
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
@@ -360,7 +361,8 @@ class _Channels:
             for channel in self._waiting.pop(record.id, ()):
                 self.add(channel)
         elif record.schema_id in self._schemas:
-            self.kinds[record.id] = ChannelKind.of(
-                record.topic, record.message_encoding, self._schemas[record.schema_id])
+            encoding, schema = record.message_encoding, self._schemas[record.schema_id]
+            self.kinds[record.id] = ChannelKind(
+                record.topic, type_of(encoding, schema), schema, encoding)
         else:
             self._waiting.setdefault(record.schema_id, []).append(record)

@@ -13,7 +13,7 @@ from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages import schema
-from mag_tracking.messages.encodings import UNDECODABLE
+from mag_tracking.messages.encodings import CDR, UNDECODABLE
 from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.types import (
     FIELD_READINGS,
@@ -213,8 +213,8 @@ class SampleReader:
     def _block_readings(self, block: MessageBlock) -> Readings:
         """Decode the readings in a block, in order of log time, and collect the true poses."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
-                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr
-                 and kind.topic not in self._shared}
+                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD
+                 and kind.encoding == CDR and kind.topic not in self._shared}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
         # Messages without a timestamp are decoded individually.

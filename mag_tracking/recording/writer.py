@@ -57,14 +57,12 @@ class Topic(NamedTuple):
 
 
 class FileSummary(NamedTuple):
-    """Entry of one file in `metadata.yaml`."""
+    """Entry of one file in `metadata.yaml`; without messages, it has no log times."""
 
     name: str
     counts: Counter[str]
     first_ns: int | None = None
-    """Log time of the first message, ns. None if the file has no messages."""
     last_ns: int | None = None
-    """Log time of the last message, ns. None if the file has no messages."""
 
 
 def open_unbuffered(path: Path) -> io.FileIO:

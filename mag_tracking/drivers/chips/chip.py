@@ -24,7 +24,6 @@ class ChipLocation(NamedTuple):
     """Location of a chip on a bus."""
 
     address: int
-    """Address of the chip."""
     multiplexer: int | None = None
     """Address of the TCA9548A multiplexer; None if the chip is directly on the bus."""
     channel: int | None = None

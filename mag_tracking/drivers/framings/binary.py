@@ -8,24 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from mag_tracking.drivers.framings import fields
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
-
-
-class Checksum(NamedTuple):
-    """Checksum algorithm.
-
-    Source of the names and polynomials: "Catalogue of parametrised CRC algorithms" (G. Cook).
-    """
-
-    size: int
-    """Length in bytes."""
-    compute: Callable[[bytes], int]
-    """Function that computes the checksum of the covered bytes."""
 
 
 def xor8(data: bytes) -> int:
@@ -61,16 +49,17 @@ def crc16_modbus(data: bytes) -> int:
     return crc
 
 
-CHECKSUMS = {
-    'sum8': Checksum(1, lambda data: sum(data) & 0xFF),
-    'xor8': Checksum(1, xor8),
-    'crc8': Checksum(1, crc8),
+CHECKSUMS: dict[str, tuple[int, Callable[[bytes], int]]] = {
+    'sum8': (1, lambda data: sum(data) & 0xFF),
+    'xor8': (1, xor8),
+    'crc8': (1, crc8),
     # CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021.
-    'crc16_ccitt': Checksum(2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
-    'crc16_modbus': Checksum(2, crc16_modbus),
+    'crc16_ccitt': (2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
+    'crc16_modbus': (2, crc16_modbus),
     # CRC-32 (ISO-HDLC), as in Ethernet and zip.
-    'crc32': Checksum(4, zlib.crc32)}
-"""Checksums by their names in the settings."""
+    'crc32': (4, zlib.crc32)}
+"""Length in bytes and function, by the names in the settings, which are those of the "Catalogue of
+parametrised CRC algorithms" (G. Cook), also the source of the polynomials."""
 _STRUCT_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
                  'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
 _ByteOrder: TypeAlias = Literal['little', 'big']
@@ -121,7 +110,7 @@ class BinaryFraming:
         self._order: _ByteOrder = fields.check_choice(
             'byte_order', settings.byte_order, ('little', 'big'))
         name = fields.check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
-        self._checksum = CHECKSUMS.get(name, Checksum(0, lambda data: 0))
+        checksum_size, self._compute = CHECKSUMS.get(name, (0, lambda data: 0))
         first = fields.check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
         frame, each = (_parse_fields('fields', settings.fields),
                        _parse_fields('each', settings.each))
@@ -135,7 +124,7 @@ class BinaryFraming:
         self._payload_start = len(self._sync)
         self._coverage_start = 0 if first == 'sync' else self._payload_start
         self._payload_end = self._payload_start + self._struct.size
-        self._checksum_end = self._payload_end + self._checksum.size
+        self._checksum_end = self._payload_end + checksum_size
         self.size = self._checksum_end + len(self._tail)
         kinds = dict(frame)
         self.CLOCK: dict[str, float] = {'wrap': _wrap(kinds['ticks'])} if 'ticks' in kinds else {}
@@ -186,7 +175,7 @@ class BinaryFraming:
             return 'with a wrong tail'
         end = start + self._payload_end
         sent_checksum = int.from_bytes(data[end:start + self._checksum_end], self._order)
-        if sent_checksum != self._checksum.compute(data[start + self._coverage_start:end]):
+        if sent_checksum != self._compute(data[start + self._coverage_start:end]):
             return 'with a wrong checksum'
         return ''
 
