@@ -90,7 +90,9 @@ def delete_markers(track: Track, frame: str) -> dict[str, Any]:
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
     """MarkerArray that shows the sensors and their names."""
-    size = min(SENSOR_SIZE_M, 0.5 * _smallest_distance(network.positions))
+    distances = np.linalg.norm(network.positions[:, None] - network.positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    size = min(SENSOR_SIZE_M, 0.5 * float(distances.min()))
     markers = []
     for j, name in enumerate(network.names):
         common = {'header': header_dict(0, network.frame), 'id': j, 'action': _ADD}
@@ -105,12 +107,6 @@ def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
             'pose': {'position': xyz(above), 'orientation': _UPRIGHT},
             'scale': {'x': 0.0, 'y': 0.0, 'z': size}})
     return {'markers': markers}
-
-
-def _smallest_distance(positions: FloatArray) -> float:
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    return float(distances.min())
 
 
 def _marker(track: Track, frame: str, namespace: str, shape: int,

@@ -33,22 +33,12 @@ _Message: TypeAlias = tuple[int, bytes, int, int]
 class Recorder:
     """Records messages in a rosbag2 folder, in a sequence of files.
 
-    While the disk is full, messages are dropped, counted and reported; once space is available,
-    recording continues in a new file. `opener` creates a file and returns an unbuffered stream.
-    Raises OutputError if the folder contains a recording or cannot be written.
-
-    Parameters
-    ----------
-    split_bytes, split_ns : size and duration after which a new file begins
-    retry_ns : delay before the next attempt after a failure
-
-    Attributes
-    ----------
-    counts : number of recorded messages by topic
-    dropped : number of messages by topic that could not be written
-    repeated : number of latched messages repeated at the start of a file, which makes it
-        self-contained
-    unfinished : files without an index
+    A new file begins after `split_bytes` or `split_ns`. While the disk is full, messages are
+    dropped and reported, and a new file is attempted every `retry_ns`. `counts` and `dropped` are
+    numbers of messages by topic, `repeated` that of latched messages at the starts of files, which
+    makes these self-contained; `unfinished` files have no index. `opener` creates a file and
+    returns an unbuffered stream. Raises OutputError if the folder contains a recording or cannot be
+    written.
     """
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,

@@ -104,22 +104,20 @@ def fault_of(message: RawMessage) -> str:
 
 
 class FrameCheck:
-    """Check that each topic has the readings of one sensor."""
+    """Check that each topic has the readings of one sensor.
+
+    `numbers` are those of the latest frames by topic, as in `FieldArrays.frame`.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._frames: dict[str, list[str]] = {}
-        self._numbers: dict[str, int] = {}
-
-    def number(self, topic: str) -> int:
-        """Number of the latest frame of a topic, as in `FieldArrays.frame`; -1 if it has none
-        yet."""
-        return self._numbers.get(topic, -1)
+        self.numbers: dict[str, int] = {}
 
     def check(self, topic: str, frame: str, number: int = -1) -> None:
         """Check the frame of a reading, and store its number; raises RecordingError if the topic
         alternates between frames."""
-        self._numbers[topic] = number
+        self.numbers[topic] = number
         frames = self._frames.setdefault(topic, [frame])
         if frame == frames[-1]:
             return
@@ -139,12 +137,8 @@ class SampleReader:
     `truth` is the topic of the true poses, by default all below `TRUTH_PREFIX`. Raises
     RecordingError if the recording contains no topic of the network, its namespace is ambiguous,
     `truth` is not a topic with poses, or the messages of the sensors have another type or encoding.
-
-    Attributes
-    ----------
-    rejected : number of messages and readings that cannot be used, or not as they are, by cause
-    clocks : first and last timestamp of each sensor so far, with their log times
-    namespace : namespace of the network's relative topics in the recording
+    `rejected` counts messages and readings that cannot be used, or not as they are, by cause;
+    `namespace` is that of the network's relative topics.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork,
@@ -244,7 +238,7 @@ class SampleReader:
     def _check_frames(self, block: MessageBlock, rows: IntArray, frames: IntArray) -> None:
         expected = np.full(max(block.kinds, default=0) + 1, -1, dtype=np.int64)
         for number, kind in block.kinds.items():
-            expected[number] = self._frames.number(kind.topic)
+            expected[number] = self._frames.numbers.get(kind.topic, -1)
         for i in np.flatnonzero(frames != expected[block.channel[rows]]):
             message = block.message(int(rows[i]))
             self._frames.check(message.topic, decode(message).header.frame_id, int(frames[i]))

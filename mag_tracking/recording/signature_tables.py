@@ -220,17 +220,13 @@ def read_model(path: FilePath) -> SignatureModel:
     try:
         with open(path, encoding='utf-8') as stream:
             content = json.load(stream)
+        if isinstance(content, dict) and content.get(_VERSION_ENTRY, VERSION) != VERSION:
+            raise RecordingError(f'{path}: format version {content[_VERSION_ENTRY]} is not '
+                                 f'supported; expected {VERSION}')
+        return _parse_model(content)
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
     except (ValueError, RecursionError) as error:
-        raise RecordingError(f'{path} is not a valid file of trained classes: '
-                             'it is not valid JSON') from error
-    if isinstance(content, dict) and content.get(_VERSION_ENTRY, VERSION) != VERSION:
-        raise RecordingError(f'{path}: format version {content[_VERSION_ENTRY]} is not supported; '
-                             f'expected {VERSION}')
-    try:
-        return _parse_model(content)
-    except ValueError as error:
         raise RecordingError(f'{path} is not a valid file of trained classes: {error}') from error
 
 

@@ -173,12 +173,8 @@ def _span(times: Sequence[int]) -> tuple[dict[str, int], dict[str, int]]:
 class McapFileWriter:
     """Writer of one MCAP file, which can be truncated to its complete chunks after a failure.
 
-    `opener` creates the file. Raises OSError if a write fails.
-
-    Attributes
-    ----------
-    counts : number of messages by topic, including pending ones
-    pending : number of messages by topic that are not yet in a complete chunk
+    `opener` creates the file; raises OSError if a write fails. `counts` are numbers of messages by
+    topic, `pending` those that are not yet in a complete chunk.
     """
 
     def __init__(self, path: Path, opener: Opener) -> None:

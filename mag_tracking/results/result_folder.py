@@ -44,20 +44,17 @@ class ResultFolder(RecordReceiver):
     def __init__(self, folder: str | PathLike[str], network: SensorNetwork) -> None:
         self.folder = output_folder(folder)
         check_no_other_recording(self.folder / _RECORDING)
-        self._files = ExitStack()
-        try:
-            self.replaces_earlier = self._remove_earlier_results()
-            self._streams = {name: self._files.enter_context(
-                new_text_file(self.folder / name, newline='')) for name in RESULT_TABLES}
-            for name, columns in RESULT_TABLES.items():
-                csv.writer(self._streams[name]).writerow(names_of(columns))
-            self._recording = TrackRecording(self.folder / _RECORDING, network)
-        except OutputError:
-            self._files.close()
-            raise
-        except OSError as error:
-            self._files.close()
-            raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
+        with ExitStack() as files:
+            try:
+                self.replaces_earlier = self._remove_earlier_results()
+                self._streams = {name: files.enter_context(
+                    new_text_file(self.folder / name, newline='')) for name in RESULT_TABLES}
+                for name, columns in RESULT_TABLES.items():
+                    csv.writer(self._streams[name]).writerow(names_of(columns))
+                self._recording = TrackRecording(self.folder / _RECORDING, network)
+            except OSError as error:
+                raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
+            self._files = files.pop_all()
 
     def _remove_earlier_results(self) -> bool:
         """Remove the results of an earlier run; return whether there were any."""

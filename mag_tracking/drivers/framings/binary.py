@@ -163,10 +163,8 @@ class BinaryFraming:
 
     def _partial_sync(self, data: bytes, at: int) -> int:
         """Length of the partial sync at the end of `data[at:]`; 0 without a partial sync."""
-        for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
-            if data.endswith(self._sync[:n]):
-                return n
-        return 0
+        return next((n for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1)
+                     if data.endswith(self._sync[:n])), 0)
 
     def _rejection_cause(self, data: bytes, start: int) -> str:
         """Reason why the frame at `start` is rejected; empty for a valid frame."""

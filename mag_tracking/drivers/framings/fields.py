@@ -189,7 +189,6 @@ def sensor_name(text: str) -> str:
 
 def ignore_value(value: object) -> None:
     """Discard a skipped value."""
-    return None
 
 
 def decode_escapes(setting: str, text: str) -> bytes:

@@ -187,6 +187,8 @@ _PREAMBLE = b'\xfa'
 _START = b'\xfa\xff'
 _MTDATA, _MTDATA2, _WAKE_UP, _ERROR = 0x32, 0x36, 0x3E, 0x42
 _DATA_MESSAGES = (_MTDATA, _MTDATA2)
+_FROM_DEVICE = (*_DATA_MESSAGES, _WAKE_UP, _ERROR)
+"""Even types of the messages that devices send."""
 _EXTENDED_LENGTH = 0xFF
 _MAX_OVERHEAD = 7
 """Number of bytes outside DATA in a message with extended length."""
@@ -230,10 +232,6 @@ _WAIT_STEP = _ParseStep(0)
 _REJECT_STEP = _ParseStep(1)
 
 
-def _is_from_device(mid: int) -> bool:
-    return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
-
-
 def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
     """Message with DATA of at most `longest` bytes that may begin at `index` of `window`, or
     None."""
@@ -241,7 +239,7 @@ def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
     header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
         return None
-    if len(header) > 2 and not _is_from_device(header[2]):
+    if len(header) > 2 and header[2] % 2 == 0 and header[2] not in _FROM_DEVICE:
         return None
     if len(header) < 4 or header[3] == _EXTENDED_LENGTH and len(header) < 6:
         return _Message(-1, len(window), len(window) + 1)

@@ -30,13 +30,11 @@ from mag_tracking.drivers.chips.continuous import Lis3mdl, Lis3mdlSettings, Rm31
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
 from mag_tracking.drivers.chips.memsic import Mmc5603, Mmc5603Settings, Mmc5983ma, Mmc5983maSettings
 from mag_tracking.drivers.reading import Arrival, Reading
-from mag_tracking.drivers.transports.polled import Closable
+from mag_tracking.drivers.transports.polled import CLOSE_WAIT_S, Closable
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 from mag_tracking.units import field_scale
 
-CLOSE_WAIT_S = 0.1
-"""[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
 _CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
 """Supported chips by name."""

@@ -27,11 +27,9 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from mag_tracking.drivers.reading import Chunk
+from mag_tracking.drivers.transports.polled import CLOSE_WAIT_S
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
-
-CLOSE_WAIT_S = 0.1
-"""[s] Maximum delay between a call of `close` and the end of the network thread."""
 
 
 @dataclass(frozen=True)
