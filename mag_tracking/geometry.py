@@ -118,8 +118,9 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
     if w < 1e-12:
         across = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
         return np.append(across / np.linalg.norm(across), 0.0)
-    q = np.append(np.cross(u, v), w)
-    return q / np.linalg.norm(q)
+    q: FloatArray = np.append(np.cross(u, v), w)
+    q /= np.linalg.norm(q)
+    return q
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:

@@ -73,31 +73,27 @@ class BagFile(RecordingFile):
                progress: Progress | None = None) -> Iterator[MessageBlock]:
         """Iterate over blocks of CDR messages from `start_ns` on, in order of log time."""
         size, total = self._path.stat().st_size, max(self.message_counts.total(), 1)
-        reported = n = 0
+        reported = n = n_bytes = 0
         messages: list[RawMessage] = []
-        n_bytes = 0
-        for topic, kind, log_time_ns, data in self._raw(start_ns):
-            if self._is_ros1:
-                data = cdr_of_ros1(data, kind)
-            messages.append(RawMessage(topic, kind, log_time_ns, data, schema_of(kind)))
-            n_bytes += len(data)
-            if len(messages) < BLOCK_SIZE and n_bytes < BLOCK_BYTES:
-                continue
-            yield MessageBlock.of_messages(messages)
-            n += len(messages)
-            messages, n_bytes = [], 0
-            if progress and (position := size * n // total) > reported:
-                progress(position - reported)
-                reported = position
+        read = self._ros1_messages if self._is_ros1 else self._sqlite_messages
+        with self._open_reader() as reader:
+            for topic, kind, log_time_ns, data in read(reader, start_ns):
+                if self._is_ros1:
+                    data = cdr_of_ros1(data, kind)
+                messages.append(RawMessage(topic, kind, log_time_ns, data, schema_of(kind)))
+                n_bytes += len(data)
+                if len(messages) < BLOCK_SIZE and n_bytes < BLOCK_BYTES:
+                    continue
+                yield MessageBlock.of_messages(messages)
+                n += len(messages)
+                messages, n_bytes = [], 0
+                if progress and (position := size * n // total) > reported:
+                    progress(position - reported)
+                    reported = position
         if messages:
             yield MessageBlock.of_messages(messages)
             if progress and size > reported:
                 progress(size - reported)
-
-    def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        with self._open_reader() as reader:
-            yield from (self._ros1_messages if self._is_ros1 else self._sqlite_messages)(
-                reader, start_ns)
 
     def _sqlite_messages(self, reader: 'Sqlite3Reader', start_ns: int | None
                          ) -> Iterator[tuple[str, str, int, bytes]]:

@@ -50,6 +50,11 @@ class ChannelKind(NamedTuple):
     schema: Schema
     encoding: str = CDR
 
+    @property
+    def is_cdr(self) -> bool:
+        """Whether the messages are encoded as CDR."""
+        return self.encoding == CDR
+
 
 class RecordingFile:
     """One file of a recording, with attributes of `Recording`; `losses` is updated in place."""

@@ -12,17 +12,9 @@ import numpy as np
 from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages import schema
-from mag_tracking.messages.encodings import CDR, UNDECODABLE
+from mag_tracking.messages import schema, types
+from mag_tracking.messages.encodings import UNDECODABLE
 from mag_tracking.messages.message_arrays import magnetic_fields
-from mag_tracking.messages.types import (
-    FIELD_READINGS,
-    IMU,
-    MAGNETIC_FIELD,
-    RAW_READINGS,
-    RawMessage,
-    decode,
-)
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.sensor_network import absolute, namespaces_of
 from mag_tracking.recording.message_block import MessageBlock, Progress
@@ -82,7 +74,7 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
                 for message in block if message.topic in topics)
     for message in islice(messages, N_FIRST_MESSAGES):
         try:
-            header = decode(message).header
+            header = types.decode(message).header
         except (RecordingError, AttributeError):
             faults[fault_of(message)] += 1
             continue
@@ -98,7 +90,7 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
         frozenset(topic for topic, ns in latest_ns.items() if ns > MIN_DATE_S * NS), frames)
 
 
-def fault_of(message: RawMessage) -> str:
+def fault_of(message: types.RawMessage) -> str:
     """Cause for which a message cannot be read."""
     return f'{message.fault or UNDECODABLE} on {message.topic}'
 
@@ -151,7 +143,7 @@ class SampleReader:
         for topic, name in zip(network.imu_topics, network.names, strict=True):
             if topic is not None:
                 self._imus.setdefault(absolute(topic, self.namespace), []).append(name)
-        self._batch_topic = absolute(RAW_READINGS, self.namespace)
+        self._batch_topic = absolute(types.RAW_READINGS, self.namespace)
         truth = None if truth is None else absolute(truth, self.namespace)
         self._truth = TruthTopics(absolute(TRUTH_PREFIX, self.namespace), network.frame, truth)
         if truth is not None and recording.types and not self._truth.accepts(
@@ -163,26 +155,26 @@ class SampleReader:
         self.rejected: Counter[str] = Counter()
         self._unknown_sensors: set[str] = set()
         self.clocks: dict[str, ClockSpan] = {}
-        self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
+        self._is_batched = recording.types.get(self._batch_topic) == types.FIELD_READINGS
         self._frames = FrameCheck(recording.path)
         self._found = self._examine_topics(network)
         self._shared = self._found.shared(network.names)
 
     def _examine_topics(self, network: SensorNetwork) -> TopicFindings:
-        types = self._recording.types
-        topics = [topic for topic in self._sensors if topic in types]
+        kinds = self._recording.types
+        topics = [topic for topic in self._sensors if topic in kinds]
         for topic in topics:
-            if types[topic] != MAGNETIC_FIELD:
-                raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
-                                     f'{MAGNETIC_FIELD} in tesla: convert the messages')
+            if kinds[topic] != types.MAGNETIC_FIELD:
+                raise RecordingError(f'{self._recording.path}: {topic} carries {kinds[topic]}, not '
+                                     f'{types.MAGNETIC_FIELD} in tesla: convert the messages')
         if self._is_batched:
             return TopicFindings(frozenset(), frozenset(), {})
         found = examine_topics(self._recording, topics or [
-            topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
-        if types and not topics and not found.shared(network.names):
+            topic for topic, kind in kinds.items() if kind == types.MAGNETIC_FIELD])
+        if kinds and not topics and not found.shared(network.names):
             raise RecordingError(
                 f'{self._recording.path} has none of the network\'s topics '
-                f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
+                f'({", ".join(self._sensors)}); {_candidates(kinds, found.frames)}')
         return found
 
     def missing_topics(self) -> list[str]:
@@ -207,8 +199,8 @@ class SampleReader:
     def _block_readings(self, block: MessageBlock) -> Readings:
         """Decode the readings in a block, in order of log time, and collect the true poses."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
-                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD
-                 and kind.encoding == CDR and kind.topic not in self._shared}
+                 if kind.topic in self._sensors and kind.type == types.MAGNETIC_FIELD
+                 and kind.is_cdr and kind.topic not in self._shared}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
         # Messages without a timestamp are decoded individually.
@@ -241,7 +233,7 @@ class SampleReader:
             expected[number] = self._frames.numbers.get(kind.topic, -1)
         for i in np.flatnonzero(frames != expected[block.channel[rows]]):
             message = block.message(int(rows[i]))
-            self._frames.check(message.topic, decode(message).header.frame_id, int(frames[i]))
+            self._frames.check(message.topic, types.decode(message).header.frame_id, int(frames[i]))
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -256,22 +248,22 @@ class SampleReader:
         messages = self._recording.messages(progress=progress)
         return (record for record, _ in self._records(messages, self._imus))
 
-    def _records(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
+    def _records(self, messages: Iterable[types.RawMessage], imus: Mapping[str, Sequence[str]]
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
         """Decode messages to (record, log time [ns]), collect the true poses, and count the
         messages that cannot be decoded; `imus` maps topics of accelerations to sensors."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             is_truth = self._truth.accepts(message.topic, message.type)
-            is_batch = message.topic == self._batch_topic and message.type == FIELD_READINGS
-            imu_sensors = imus.get(message.topic) if message.type == IMU else None
+            is_batch = message.topic == self._batch_topic and message.type == types.FIELD_READINGS
+            imu_sensors = imus.get(message.topic) if message.type == types.IMU else None
             is_shared = message.topic in self._shared
             if sensor is None and not (is_shared or imu_sensors or is_truth or is_batch):
                 continue
             try:
-                if (sensor is not None or is_shared) and message.type != MAGNETIC_FIELD:
+                if (sensor is not None or is_shared) and message.type != types.MAGNETIC_FIELD:
                     raise RecordingError(f'{message.topic} carries {message.type}')
-                content = decode(message)
+                content = types.decode(message)
                 readings = schema.readings_of(content) if is_batch else None
             except RecordingError:
                 self.rejected[fault_of(message)] += 1
@@ -292,7 +284,7 @@ class SampleReader:
                 yield from self._single(content, frame if sensor is None or is_shared else sensor,
                                         message)
 
-    def _single(self, content: schema.MagneticField, sensor: str, message: RawMessage
+    def _single(self, content: schema.MagneticField, sensor: str, message: types.RawMessage
                 ) -> Iterator[tuple[Readings, int]]:
         """Convert a decoded message unless its sensor is not in the network or its time is
         missing."""
@@ -340,11 +332,11 @@ class SampleReader:
         return self._truth.arrays()
 
 
-def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
+def _candidates(kinds: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
     fields = [topic + (f' (with the frame_ids {", ".join(sorted(frames[topic]))})'
                        if len(frames.get(topic, ())) > 1 else '')
-              for topic, kind in sorted(types.items()) if kind == MAGNETIC_FIELD]
-    topics = [f'{topic} ({kind})' for topic, kind in sorted(types.items())[:MAX_TOPICS]]
+              for topic, kind in sorted(kinds.items()) if kind == types.MAGNETIC_FIELD]
+    topics = [f'{topic} ({kind})' for topic, kind in sorted(kinds.items())[:MAX_TOPICS]]
     return f'topics with magnetic fields: {", ".join(fields)}' if fields else \
         f'topics with magnetic fields: none found; topics: {", ".join(topics)}'
 
@@ -355,8 +347,8 @@ def _namespace(recording: Recording, network: SensorNetwork) -> str:
     if network.namespace is not None:
         return network.namespace
     names = [name for name, kind in recording.types.items()
-             if kind in (MAGNETIC_FIELD, FIELD_READINGS)]
-    found = namespaces_of((*network.topics, RAW_READINGS), names)
+             if kind in (types.MAGNETIC_FIELD, types.FIELD_READINGS)]
+    found = namespaces_of((*network.topics, types.RAW_READINGS), names)
     if len(found) > 1:
         raise RecordingError(f'{recording.path} has the topics of the network in the namespaces '
                              f'{", ".join(found)}: choose one with --namespace')

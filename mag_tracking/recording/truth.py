@@ -11,7 +11,6 @@ from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_between
-from mag_tracking.messages.encodings import CDR
 from mag_tracking.messages.message_arrays import poses
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
@@ -61,8 +60,7 @@ class TruthTopics:
         collected: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         for channel, kind in block.kinds.items():
             rows: IntArray = np.flatnonzero(block.channel == channel)
-            if len(rows) and (kind.type, kind.encoding) == (POSE, CDR) \
-                    and self.accepts(kind.topic, POSE):
+            if len(rows) and kind.type == POSE and kind.is_cdr and self.accepts(kind.topic, POSE):
                 is_decoded, stamps, pose = poses(
                     block.data, block.begin[rows], block.end[rows], self._frame)
                 collected.append(rows[is_decoded])
