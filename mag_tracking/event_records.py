@@ -59,16 +59,14 @@ class Disturbance:
     """Time at which the disturbance was identified or, if `ended`, at which it ended."""
     id: int
     ended: bool
-    """True if the network is quiet again or the frames have ended. False while the disturbance
-    continues."""
+    """True if the network is quiet again or the frames have ended; False while it continues."""
     begin_ns: int
     largest: float
     """Largest magnitude of the field at any sensor, T."""
     sensors: tuple[str, ...]
     """Names of the affected sensors, in descending order of the field magnitude."""
     uniform: float
-    """Probability of one common field across the network, as opposed to an independent field at
-    each sensor."""
+    """Probability of one common field across the network, as opposed to one at each sensor."""
     track_id: int
     """Number of the latest track that the disturbance has made ambiguous."""
 
@@ -92,8 +90,7 @@ class VehiclePassage:
     position: FloatArray
     """Position of the crossing, (3,) m, world frame."""
     lateral: float
-    """Distance of `position` from the middle of the line, m. Positive to the left of the forward
-    direction."""
+    """Distance of `position` from the middle of the line, m. Positive to the left when forward."""
     velocity: FloatArray
     """Velocity, (3,) m/s, world frame."""
     speed: float

@@ -24,8 +24,7 @@ MAX_BYTES = 2_000_000
 MAX_DEPTH = 64
 """Maximum depth of lists and mappings after expansion of aliases."""
 MAX_BITS = 14_000
-"""Maximum size of an integer [bits]. Python does not format integers of more than 4300 decimal
-digits."""
+"""Maximum size of an integer [bits]. Python does not format more than 4300 decimal digits."""
 _REPR = Repr()
 _REPR.maxlevel, _REPR.maxstring, _REPR.maxother, _REPR.maxlong = 3, 200, 200, 200
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = 20

@@ -86,15 +86,13 @@ def rotation_about_z(angle: float) -> FloatArray:
 
 
 def yaw_between(R: FloatArray, other: FloatArray) -> float:
-    """Rotation about the world z axis, in [-pi, pi] rad, that brings orientation `R` closest to
-    `other`."""
+    """Rotation about the world z axis, in [-pi, pi] rad, that brings `R` closest to `other`."""
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Unit quaternion (4,) of a rotation matrix, numerically stable, with a positive largest
-    component."""
+    """Unit quaternion (4,) of a rotation matrix, whose largest component is positive."""
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
     k = int(np.argmax(w2))
@@ -124,8 +122,7 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Speed and its std, at zero the largest in any direction, of a velocity (d,) with covariance
-    (d, d)."""
+    """Speed and std (at 0 the largest in any direction) of a velocity (d,), covariance (d, d)."""
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
         return 0.0, float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

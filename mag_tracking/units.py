@@ -46,16 +46,14 @@ _PER_COUNT = re.compile(rf'([+-]?){_NUMBER}\s*([^\s/0-9.]+)(?:\s*(?:/|\bper\b)\s
 
 
 def field_unit(text: str) -> str | None:
-    """Key of `FIELD_UNITS` that a text names in any usual spelling ('µT', 'uT', '[nT]',
-    'Gauss')."""
+    """Key of `FIELD_UNITS` that a text names in any usual spelling ('µT', '[nT]', 'Gauss')."""
     name = _plain_name(text)
     # 'MT' is not millitesla, and 'MG' is not milligauss.
     return None if name[:1] == 'M' and len(name) == 2 else _FIELD_OF.get(name.lower())
 
 
 def time_unit(text: str) -> str | None:
-    """Key of `TIME_UNITS` that a text names in any usual spelling, such as 'ms', 'millis' or
-    'µs'."""
+    """Key of `TIME_UNITS` that a text names in any usual spelling ('ms', 'millis', 'µs')."""
     return _TIME_OF.get(_plain_name(text).lower())
 
 

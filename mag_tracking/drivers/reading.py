@@ -15,8 +15,7 @@ Axes: TypeAlias = tuple[float, float, float]
 
 
 class DeviceDate(float):
-    """Date and time of a device's clock, in microseconds since 1970 UTC, whatever the clock
-    settings."""
+    """Date and time of a device, in microseconds since 1970 UTC, whatever the clock settings."""
 
 
 class Reading(NamedTuple):

@@ -42,8 +42,7 @@ class DriverSettings:
 
 
 def acceleration_scale(unit: str) -> float:
-    """Convert a key of `ACCELERATION_UNITS` or a number (m/s² per count) to m/s²; raises
-    SettingsError."""
+    """Convert a key of `ACCELERATION_UNITS` or a number to m/s² per count; raises SettingsError."""
     if unit in ACCELERATION_UNITS:
         return ACCELERATION_UNITS[unit]
     try:

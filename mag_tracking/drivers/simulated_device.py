@@ -136,8 +136,7 @@ class SimulatedDevice:
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _field_of_pass(self) -> FloatArray:
-        """Field at each time of a pass, (n, n_sensors, 3) T, sensor frames; the last row has no
-        vehicle."""
+        """Field during a pass, (n, n_sensors, 3) T, sensor frames; the last row has no vehicle."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)

@@ -28,8 +28,7 @@ ROS1 = 'ros1'
 _ENCAPSULATIONS = {2: 'CDR with parameter lists', 3: 'CDR with parameter lists', 6: 'XCDR2',
                    7: 'XCDR2', 8: 'XCDR2 with delimiters', 9: 'XCDR2 with delimiters',
                    10: 'XCDR2 with parameter lists', 11: 'XCDR2 with parameter lists'}
-"""Encodings that DDS may use in place of plain CDR, by the second byte of a message (DDS-XTypes
-1.3, table 60)."""
+"""Other encodings of DDS than CDR, by the second byte of a message (DDS-XTypes 1.3, table 60)."""
 _FIELD_DOUBLES = 12
 """Number of float64 values in a MagneticField: x, y, z and the covariance."""
 _STAMPS = ('stamp', 'timestamp')
@@ -42,8 +41,7 @@ UNDECODABLE = 'undecodable message'
 
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
-    """Convert a serialised ROS 1 message to CDR; empty if damaged or of an unsupported type (name
-    in ROS 2)."""
+    """Convert a ROS 1 message to CDR; empty if damaged or of an unsupported type (ROS 2 name)."""
     if type_name not in DEFINITIONS:
         return b''
     try:

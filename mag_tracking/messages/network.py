@@ -77,8 +77,7 @@ class _Calibration(Protocol):
 
 
 def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> MessageDict:
-    """Convert the calibration of sensor `j` to mag_tracking_msgs/SensorCalibration; unknown values
-    are NaN."""
+    """Calibration of sensor `j` as mag_tracking_msgs/SensorCalibration; NaN if unknown."""
     name = network.names[j]
     background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
     ready = background.ready and calibrate.last_stamp_ns(name) is not None

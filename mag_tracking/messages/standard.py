@@ -23,8 +23,7 @@ _ADD, _DELETE = 0, 2
 _REGION_RADIUS = 2.5003
 """Radius of the 90 % region in standard deviations (chi-square, 3 degrees of freedom)."""
 SENSOR_SIZE_M = 0.3
-"""[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
-distance."""
+"""[m] Maximum length of a sensor marker, which is at most half the smallest sensor distance."""
 _UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
 _BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
 """Colours that remain distinguishable with colour blindness (Okabe and Ito)."""
@@ -112,8 +111,7 @@ def _marker(track: Track, frame: str, namespace: str, shape: int,
 
 
 def ellipsoid_axes(C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (3,) along the axes of a covariance (3, 3), and the quaternion xyzw that
-    rotates to them."""
+    """Standard deviations (3,) along the axes of a covariance (3, 3), and their quaternion xyzw."""
     variances, R = np.linalg.eigh(C)
     if np.linalg.det(R) < 0.0:
         R = -R

@@ -239,8 +239,7 @@ def _sessions(rows: _Rows, stamps: Sequence[int], session: Sequence[int], order:
 
 def import_field_table(table: FilePath, options: TableOptions, out: FilePath
                        ) -> tuple[list[Path], FieldTable]:
-    """Import a table as recordings in `out`, or in its folders `session_1`, `session_2`, ... if the
-    clock restarts."""
+    """Import a table to the folder `out`, or, if the clock restarts, to `session_1`, ... in it."""
     content = read_field_table(table, options)
     recordings = []
     for k, readings in enumerate(content.sessions):
@@ -254,8 +253,7 @@ def import_field_table(table: FilePath, options: TableOptions, out: FilePath
 
 
 def describe(readings: Readings) -> list[str]:
-    """Number, rate, gaps and median field of each sensor's readings (chronological), one line each,
-    and warnings."""
+    """Lines with number, rate, gaps and median field of each sensor's readings, and warnings."""
     out, magnitudes = [], []
     spans: dict[str, tuple[int, int]] = {}
     begin = int(readings.stamp_ns.min())

@@ -73,16 +73,14 @@ _UNKNOWN = _Kind('of an unknown format', 'Recordings are .mcap, .db3 and .bag fi
 
 
 def describe_file(path: Path) -> str:
-    """Sentences that name a file that is no recording, its kind, and the command or program to read
-    it."""
+    """Sentences that name a file that is no recording, its kind, and the program to read it."""
     kind = _kind_of(path)
     return f'{path} is not a recording but {kind.description}. {kind.advice}'.replace(
         'FILE', str(path))
 
 
 def binary_kind(path: Path) -> str:
-    """Kind of a binary file and the command or program to read it; empty for text and unknown
-    formats."""
+    """Kind of a binary file and the program to read it; empty for text and unknown formats."""
     kind = _kind_of(path)
     return '' if kind in (_UNKNOWN, *(k for _, k in _TEXT)) else \
         f'{kind.description}. {kind.advice}'.replace('FILE', str(path))

@@ -33,8 +33,7 @@ the position of each message also takes memory."""
 RECORD_HEADER = struct.Struct('<BQ')
 """Operation code and length of the content of a record."""
 _FOOTER = struct.Struct('<BQQQI8s')
-"""Record `Footer` (operation code, length, start of summary and of summary offsets, CRC) and
-`MAGIC`."""
+"""Record `Footer` (code, length, start of summary and of summary offsets, CRC) and `MAGIC`."""
 _CHUNK_HEADER = struct.Struct('<QQQII')
 """Times of the first and last message [ns], uncompressed size, CRC, length of the compression."""
 _MAX_NAME = 64
@@ -86,8 +85,7 @@ class ChunkHeader(NamedTuple):
 
 
 def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
-    """Read the header of a chunk, up to the beginning of its content; raises ValueError or EOFError
-    if it is damaged."""
+    """Read the header of a chunk, up to its content; raises ValueError or EOFError if damaged."""
     stream.seek(chunk.begin)
     opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
     if opcode != Opcode.CHUNK or chunk.begin + RECORD_HEADER.size + length != chunk.end:
@@ -290,8 +288,7 @@ class McapFile(RecordingFile):
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over the messages chunk by chunk, in order of log time, without chunks that end
-        before `start_ns`."""
+        """Iterate over the chunks by log time, without those that end before `start_ns`."""
         pending = MessageBlock.of_messages([])
         parts = [p for p in self._parts if start_ns is None or p.end_ns >= start_ns]
         starts = [p.start_ns for p in parts[1:]]

@@ -92,8 +92,7 @@ class MessageBlock:
     @classmethod
     def of_rows(cls, data: bytes, kinds: Mapping[int, ChannelKind],
                 rows: IntArray) -> 'MessageBlock':
-        """Create a block from rows (n, 4) in any order: channel, log time [ns], begin and end in
-        `data`."""
+        """Create a block of rows (n, 4) in any order: channel, log time [ns], begin and end."""
         block = cls(data, kinds, *np.ascontiguousarray(rows.T))
         if np.all(rows[1:, 1] >= rows[:-1, 1]):
             return block

@@ -22,8 +22,7 @@ from mag_tracking.recording import writer
 from mag_tracking.recording.repair import finish_file
 
 FLUSH_INTERVAL_NS = 400_000_000
-"""Interval between flushes [ns]. A crash loses the messages of at most one flush interval plus one
-tick interval."""
+"""Interval between flushes [ns]. A crash loses at most one flush and one tick interval."""
 MIN_FREE_BYTES = 4 << 20
 """Minimum free disk space for a new file after a failure [bytes]."""
 _Message: TypeAlias = tuple[int, bytes, int, int]
@@ -93,8 +92,7 @@ class Recorder:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a CDR message of a registered topic, received at `log_ns`, or count it as
-        dropped."""
+        """Record a CDR message of a topic, received at `log_ns`, or count it as dropped."""
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
         if self._file and self._file.counts and self._file.size >= self._split_bytes:
@@ -157,8 +155,7 @@ class Recorder:
         self._finished_bytes += file.size
 
     def _abandon(self, file: writer.McapFileWriter, error: OSError) -> None:
-        """Close the open file at its last complete chunk, count the lost messages, and schedule a
-        retry."""
+        """Close the file at its last complete chunk, count lost messages, and schedule a retry."""
         self._file = None
         lost_counts = file.pending if file.path.exists() else file.counts
         self.dropped += lost_counts

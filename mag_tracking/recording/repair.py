@@ -78,8 +78,7 @@ class _Scan:
             self.chunks[-1].message_index_length += record.end - record.begin
 
     def _add_content(self, data: bytes) -> tuple[IntArray, int]:
-        """Add records; return the rows of their messages, as `records_of`, and the length of the
-        complete records."""
+        """Add records; return the rows of their messages and the length of the complete records."""
         rows, definitions, end = core.records_of(
             data, 2**63 - 1, self._limit // mcap_file.MIN_BYTES_PER_MESSAGE)
         for definition in mcap_file.definitions_of(data, definitions):

@@ -30,14 +30,12 @@ N_FIRST_MESSAGES = 200
 MAX_FIRST_BLOCKS = 50
 """Number of blocks after which the check ends in any case."""
 MIN_DATE_S = 1e8
-"""Least timestamp that is a date, and not the time since the start of a simulation or a computer
-[s since 1970]."""
+"""Least timestamp that is a date, not the time since the start of a simulation [s since 1970]."""
 N_FRAME_CHANGES = 3
 """Number of changes of frame_id after which a topic has several sensors. A driver that was
 restarted with another frame changes it once or twice."""
 TRUTH_PREFIX = 'ground_truth/'
-"""Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
-never for tracking."""
+"""Prefix of topics with true poses in the sensors' namespace, for reports, never for tracking."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
@@ -63,8 +61,7 @@ class TopicFindings(NamedTuple):
 
 
 def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindings:
-    """Examine the first messages of the sensors' topics; raises RecordingError if none is
-    readable."""
+    """Examine the first messages of the topics; raises RecordingError if none is readable."""
     n_zero: Counter[str] = Counter()
     n_read: Counter[str] = Counter()
     faults: Counter[str] = Counter()
@@ -178,8 +175,7 @@ class SampleReader:
         return found
 
     def missing_topics(self) -> list[str]:
-        """Topics of the network that are not in the recording; none if one topic carries several
-        sensors."""
+        """Topics of the network that were not recorded; none if one topic has several sensors."""
         if self._is_batched or self._shared:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
@@ -286,8 +282,7 @@ class SampleReader:
 
     def _single(self, content: schema.MagneticField, sensor: str, message: types.RawMessage
                 ) -> Iterator[tuple[Readings, int]]:
-        """Convert a decoded message unless its sensor is not in the network or its time is
-        missing."""
+        """Convert a message unless its sensor is not in the network or its time is missing."""
         reading = self._network_readings(schema.reading_of(content, sensor))
         if not reading.stamp_ns.all():
             cause = f'{ZERO_STAMP} on {message.topic}'

@@ -68,8 +68,7 @@ def read_signatures(path: FilePath, is_labelled: bool = True) -> list[Signature]
 
 
 def _read_by_sample(table: CsvTable) -> list[Signature]:
-    """Read a table with one row per sample; the columns without field, label, time or pass identify
-    the signature."""
+    """Read a table with one row per sample, whose remaining columns identify the signature."""
     path, header = table.path, table.header
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
@@ -96,8 +95,7 @@ def _read_by_sample(table: CsvTable) -> list[Signature]:
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Value that all rows have in a column, '' if it is missing; raises LabelsError if they
-    differ."""
+    """Value of all rows in a column, '' if it is missing; raises LabelsError if they differ."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')

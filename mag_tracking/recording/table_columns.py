@@ -90,8 +90,7 @@ def parse_columns(texts: Sequence[str]) -> _Assigned:
 
 
 def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -> str:
-    """Name of a sensor from a text at `where`, by `names` or as `mag_3` for 3; raises
-    RecordingError."""
+    """Sensor name of a text at `where`, by `names` or as `mag_3` for 3; raises RecordingError."""
     text = text.strip()
     if names and text in names:
         return names[text]

@@ -36,8 +36,7 @@ class Table:
     """Line number and fault of each unusable row."""
 
     def check_bad_rows(self, n_good: int) -> None:
-        """Raise the first fault as RecordingError if more than `MAX_BAD_FRACTION` of the rows, or
-        all, are unusable."""
+        """Raise the first fault as RecordingError if too many rows, or all, are unusable."""
         n, n_bad = n_good + len(self.bad), len(self.bad)
         if n_bad > MAX_BAD_FRACTION * n:
             line, fault = min(self.bad)

@@ -39,8 +39,7 @@ Opener: TypeAlias = Callable[[Path], io.FileIO]
 
 
 def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """QoS profile of a topic as rosbag2 writes it, YAML: reliable or best-effort, latched or
-    volatile."""
+    """QoS profile as rosbag2 writes it, YAML: reliable or best-effort, latched or volatile."""
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')
     return text.replace('durability: volatile', 'durability: transient_local') if latched else text
@@ -71,8 +70,7 @@ def open_unbuffered(path: Path) -> io.FileIO:
 
 
 def open_locked(path: Path) -> io.FileIO:
-    """Create a file as `open_unbuffered`, and lock it, if possible, against repair while it is
-    written."""
+    """Create a file as `open_unbuffered`, and lock it, if possible, against repair."""
     stream = open_unbuffered(path)
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -116,8 +114,7 @@ def check_no_recording(folder: Path) -> None:
 
 
 def check_no_other_recording(path: Path) -> None:
-    """Raise OutputError if the folder of a new MCAP file has a `metadata.yaml` that does not list
-    it."""
+    """Raise OutputError if the folder of a new file has a `metadata.yaml` that does not list it."""
     metadata = path.parent / 'metadata.yaml'
     try:
         # Only a regular file is read: a pipe or a device could block.
@@ -230,8 +227,7 @@ class McapFileWriter:
             name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
 
     def flush(self) -> None:
-        """Complete the current chunk, so that a crash cannot lose its messages; raises OSError also
-        if the file was removed."""
+        """Complete the chunk, so that a crash cannot lose it; raises OSError for a removed file."""
         self._complete_chunk()
         if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
             raise OSError(errno.ENOENT, 'the file was removed')

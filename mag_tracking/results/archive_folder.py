@@ -254,8 +254,7 @@ class ArchiveFolder:
                 table.add(row)
 
     def summaries(self, report: Callable[[str], object]) -> Iterator[dict[str, Any]]:
-        """Summaries of all processed recordings of all runs; damaged ones are reported and left
-        out."""
+        """Summaries of all processed recordings; damaged ones are reported and left out."""
         for path in sorted((self.path / _DONE).glob('*.json')):
             try:
                 yield _read_summary(path)

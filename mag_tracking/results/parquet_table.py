@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 3
-"""Version of the tables. Folders of other versions are rejected, because their rows would not be
-comparable."""
+"""Version of the tables. Folders of other versions are rejected: rows are not comparable."""
 
 MAX_BUFFERED_ROWS = 5000
 

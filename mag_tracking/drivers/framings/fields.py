@@ -143,8 +143,7 @@ def ticks_value(value: float) -> float:
 
 
 def text_number(text: str, decimal: str) -> float:
-    """Convert a text, as in quotes, to float; raises ValueError unless it is decimal, nan or
-    inf."""
+    """Convert a text to float; raises ValueError unless it is decimal, nan or inf."""
     text = text.strip()
     if decimal == ',':
         text = text.replace(',', '.')

@@ -233,8 +233,7 @@ _REJECT_STEP = _ParseStep(1)
 
 
 def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
-    """Message with DATA of at most `longest` bytes that may begin at `index` of `window`, or
-    None."""
+    """Message with DATA of at most `longest` bytes that may begin at `index`, or None."""
     # While the header is incomplete, MID is -1 and the end is one byte after the window.
     header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
@@ -325,8 +324,7 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Step that rejects `outer` for another data message in it, or waits for more bytes; None
-        without a message."""
+        """Step that rejects `outer` for a data message in it, or waits for bytes; None without."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
