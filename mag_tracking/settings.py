@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
-"""Type of the value of a setting."""
 USER, EXPERT = 'user', 'expert'
 """Levels: settings that describe the site, the targets and the wanted results; and settings of the
 methods, which rarely change."""

@@ -129,7 +129,6 @@ FORMS = ('2026-05-03T23:56:01.250Z (ISO 8601), 2026-05-03 23:56:01.250, 03.05.20
 MAX_LENGTH = 80
 """Maximum length of a time."""
 DAY_NS = 86400 * NS
-"""Nanoseconds per day."""
 _MONTHS = {name: k + 1 for k, name in enumerate(
     'jan feb mar apr may jun jul aug sep oct nov dec'.split())}
 _SEPARATED = r'([0-9]{1,4})([-/. ])\s?([0-9]{1,2})\2\s?([0-9]{1,4})'

@@ -44,10 +44,8 @@ KINDS = {
     'device': {'i2c': f'{_PACKAGE}.transports.i2c:I2cDevice',
                'simulator': f'{_PACKAGE}.simulated_device:SimulatedDevice'},
 }
-"""Class of each kind of transport, framing and device."""
 REQUIRED_MEMBERS = {'transport': ('is_message_oriented', 'open', 'read', 'close'),
                     'framing': ('parse',), 'device': ('open', 'read', 'close')}
-"""Members that the class of a transport, framing or device must have besides `SETTINGS`."""
 _ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
 """Keys of a device other than the driver settings and the groups of its kinds."""
 _NAME_PATTERN = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')

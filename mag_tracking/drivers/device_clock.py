@@ -27,7 +27,6 @@ from mag_tracking.settings import param
 from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
 
 Point: TypeAlias = tuple[float, float]
-"""Coordinates (x, y) of a point."""
 
 
 def lower_hull(points: Sequence[Point]) -> list[Point]:

@@ -37,7 +37,6 @@ _AXES_STRUCT = struct.Struct('3d')
 PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """Fields and accelerations received by one poll."""
 EMPTY_RESULT: PollResult = Readings.joined([]), ()
-"""Result of a poll without data."""
 MIN_CLOCK_STEP_NS = 10_000_000
 """[ns] A larger change of wall clock minus monotonic clock is counted as a clock step."""
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 Axes: TypeAlias = tuple[float, float, float]
-"""Components x, y and z of a vector."""
 
 
 class DeviceDate(float):

@@ -10,7 +10,6 @@ from mag_tracking.settings import param
 ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
 """Factor from each unit to m/s²."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
-"""Permitted values of `stamp_by`."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
 SELF_DESCRIBED = ('json', 'protobuf')
 """Encodings whose messages are converted by means of their schema or of their own names."""
 UNDECODABLE = 'undecodable message'
-"""Fault of a message whose bytes do not match its type."""
 
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 HEAD_SIZE = 4096
-"""Number of bytes at the beginning of a file by which it is recognised."""
 _IMPORT = 'then use `mag-tracking import`'
 _TO_CSV = f'No command reads it: write the field and its time to a CSV file, {_IMPORT}'
 

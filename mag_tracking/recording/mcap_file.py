@@ -76,7 +76,6 @@ class ChunkHeader(NamedTuple):
 
     start_ns: int
     end_ns: int
-    """Log time of the last message [ns]."""
     crc: int
     """CRC of the content; 0 if unknown."""
     compression: str

@@ -46,7 +46,6 @@ class ChannelKind(NamedTuple):
 
     topic: str
     type: str
-    """Message type, as from `type_of`."""
     schema: Schema
     encoding: str = CDR
 

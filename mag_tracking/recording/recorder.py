@@ -11,7 +11,7 @@ import os
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
@@ -29,7 +29,7 @@ _Message: TypeAlias = tuple[int, bytes, int, int]
 """Sequence number, CDR, log time [ns] and publish time [ns]."""
 
 
-class Recorder:
+class Recorder(AbstractContextManager['Recorder']):
     """Records messages in a rosbag2 folder, in a sequence of files.
 
     A new file begins after `split_bytes` or `split_ns`. While the disk is full, messages are
@@ -65,9 +65,6 @@ class Recorder:
             self._open_next()
         except OSError as error:
             raise OutputError(f'cannot record in {self.folder}: {error.strerror}') from error
-
-    def __enter__(self) -> 'Recorder':
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

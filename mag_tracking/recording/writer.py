@@ -6,7 +6,7 @@ import io
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import IO, NamedTuple, TypeAlias, cast
@@ -265,7 +265,7 @@ class McapFileWriter:
         return FileSummary(self.path.name, Counter(self.counts), *self._span)
 
 
-class RecordingWriter:
+class RecordingWriter(AbstractContextManager['RecordingWriter']):
     """Writes messages to an MCAP file and a `metadata.yaml` in its folder; a context manager.
 
     `latched` are the topics with transient local durability. Parent folders are created; raises
@@ -284,9 +284,6 @@ class RecordingWriter:
         except OSError as error:
             raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
         self._file.start()
-
-    def __enter__(self) -> 'RecordingWriter':
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -18,7 +18,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -134,7 +134,7 @@ def _hash(text: str) -> str:
     return hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]
 
 
-class ArchiveFolder:
+class ArchiveFolder(AbstractContextManager['ArchiveFolder']):
     """Folder of an archive, locked against other runs until it is closed; a context manager.
 
     `head` is metadata that must be identical in all runs that write to the folder. Raises
@@ -181,9 +181,6 @@ class ArchiveFolder:
     def close(self) -> None:
         """Release the lock."""
         os.close(self._lock)
-
-    def __enter__(self) -> 'ArchiveFolder':
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -6,7 +6,7 @@ pyarrow is imported when a table is written or read.
 import math
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +65,7 @@ def is_complete(path: Path) -> bool:
         return begin == stream.read() == _MAGIC and stream.tell() > 2 * len(_MAGIC)
 
 
-class TableWriter:
+class TableWriter(AbstractContextManager['TableWriter']):
     """Writer of a Parquet file, in batches of rows; a context manager.
 
     An existing file is replaced only on success; after an error, none is created.
@@ -110,9 +110,6 @@ class TableWriter:
             with self._convert_errors():
                 self._writer.write_table(
                     import_pyarrow().Table.from_pylist(rows, self._schema))
-
-    def __enter__(self) -> 'TableWriter':
-        return self
 
     def __exit__(self, kind: object, *_: object) -> None:
         try:

@@ -50,7 +50,6 @@ UNITS = {
     'rm3100.RM3100_I2C': 'uT'}
 """{module.Class: unit of its field}."""
 PROPERTIES = ('magnetic', 'magnetometer')
-"""Names of the property that reads the field."""
 REPORTS = {'adafruit_bno08x.i2c.BNO08X_I2C': 0x03}
 """{module.Class: number of the report of the field, which is disabled after a reset}."""
 

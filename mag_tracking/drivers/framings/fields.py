@@ -23,7 +23,6 @@ SKIP = '-'
 Values: TypeAlias = Sequence[Any]
 """Values of one frame; the type of each follows from its field."""
 MAX_NAME = 64
-"""Maximum length of a sensor's name in characters."""
 _ESCAPE_PATTERN = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
 _ESCAPED_CHARACTERS = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
 _Choice = TypeVar('_Choice', bound=str)

@@ -37,7 +37,6 @@ from mag_tracking.units import field_scale
 
 _CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
-"""Supported chips by name."""
 NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
 ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
                    r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?(:(?P<unit>[^:]+))?')

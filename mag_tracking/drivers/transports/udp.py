@@ -30,7 +30,6 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 
 MAX_DATAGRAMS_PER_READ = 1000
-"""Maximum number of datagrams per `read`."""
 CLOCK_SET_NS = 1_000_000
 """[ns] A larger change of the clock difference indicates that the wall clock was set."""
 SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
