@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from mag_tracking.arrays import FloatArray
 
 SIGNATURE_SPAN = 4.0
-"""Half the duration of a signature, in units of `PassEvent.time_scale`. A signature is centred on
-the closest point of approach."""
+"""Half the duration of a signature about the closest point, in units of `PassEvent.time_scale`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +84,7 @@ class VehiclePassage:
     """Whether the vehicle moved in the forward direction of the line."""
     direction_error: float
     """Probability that the direction is wrong, from the rotation of the field at each sensor near
-    the path, independently of the track. NaN if the rotation is inconclusive or another vehicle was
-    nearby."""
+    the path, independently of the track. NaN if inconclusive or another vehicle was nearby."""
     position: FloatArray
     """Position of the crossing, (3,) m, world frame."""
     lateral: float

@@ -17,8 +17,7 @@ from mag_tracking.errors import MagTrackingError, OutputError
 MAX_NODES = 1_000_000
 """Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
 MAX_ENTRIES = 1000
-"""Maximum number of entries of a mapping, such as the sensors of a network. The parser needs half a
-minute for 10,000 sensors."""
+"""Maximum number of entries of a mapping. The parser needs half a minute for 10,000 sensors."""
 MAX_BYTES = 2_000_000
 """Maximum size of a file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
 MAX_DEPTH = 64

@@ -30,8 +30,7 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors (..., 3)
-    [rad] in world axes."""
+    """Rotation vectors (..., 3) [rad], world axes, from orientation `q` (4,) to others (..., 4)."""
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
     along = other[..., 3:] * v + w * other[..., :3] + np.cross(other[..., :3], v)
@@ -57,8 +56,7 @@ def cross_matrix(a: ArrayLike) -> FloatArray:
 def left_jacobian(v: ArrayLike) -> FloatArray:
     """Left Jacobian J (..., 3, 3) of SO(3) at rotation vectors `v` (..., 3) [rad].
 
-    To first order R(v + d) = R(J d) R(v); J is the identity at v = 0. See [Sola18]_, appendix on
-    SO(3).
+    To first order R(v + d) = R(J d) R(v); J is the identity at v = 0. See [Sola18]_, SO(3).
     """
     v = np.asarray(v, dtype=float)
     square = np.einsum('...i,...i->...', v, v)[..., None, None]
@@ -131,8 +129,7 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Heading anticlockwise from x and its std [rad], at zero speed 0 and inf, of a velocity with
-    two or three components."""
+    """Heading from x and its std [rad], 0 and inf at rest, of a velocity with 2 or 3 components."""
     vx, vy = velocity[:2]
     if vx == vy == 0.0:
         return 0.0, float('inf')

@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
 USER, EXPERT = 'user', 'expert'
-"""Levels: settings that describe the site, the targets and the wanted results; and settings of the
-methods, which rarely change."""
+"""Levels: settings of the site, the targets and the wanted results, and of the methods."""
 _ROW_NAME = re.compile(r'(?!names$)\w[\w -]*')
 """Permitted names of the rows of a table."""
 _Class: TypeAlias = type[object]

@@ -150,8 +150,7 @@ _TIME = re.compile(r'''(?:(?P<days>[0-9]+)\s*days?,?\s+)?
 
 
 def parse_time(text: str, order: str = 'dmy') -> tuple[int, bool, bool]:
-    """Convert a date and time (ns since 1970), or a time of day (ns since midnight), to
-    nanoseconds.
+    """Convert a date and time to ns since 1970, or a time of day to ns since midnight.
 
     Return also whether there is a date, and whether there is a zone: Z, UTC, GMT or an offset.
     Without it, the zone is UTC. `order`, a value of `DATE_ORDERS`, applies to a date of three

@@ -84,8 +84,7 @@ class Driver:
 
     @property
     def fault(self) -> str:
-        """Message of the latest failure, or, if data have arrived since, the sensors whose readings
-        are sent by several sources."""
+        """Latest failure, or, if data have arrived since, the sensors with several sources."""
         return self._failure or self._contest
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
@@ -116,8 +115,7 @@ class Driver:
     def poll(self, timeout_s: float) -> PollResult:
         """Return the samples received since the last call; wait for data for at most `timeout_s`.
 
-        Device errors are not raised but stored in `fault`. Raises ValueError if a field does not
-        consist of three numbers.
+        Device errors are stored in `fault`. Raises ValueError if a field is not three numbers.
         """
         if not self.is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT

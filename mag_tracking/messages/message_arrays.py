@@ -26,8 +26,7 @@ class FieldArrays(NamedTuple):
 
     is_decoded: BoolArray
     """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
-    CDR, or in a frame with a non-ASCII name. The corresponding elements of the other arrays are
-    invalid."""
+    CDR, or in a frame with a non-ASCII name. Its elements of the other arrays are invalid."""
     stamp_ns: IntArray
     field: FloatArray
     """(n, 3) [T] Field, sensor frame."""
@@ -35,6 +34,16 @@ class FieldArrays(NamedTuple):
     """(n, 3, 3) [T^2] Covariance; NaN where unknown, None if all are unknown, as in `Readings`."""
     frame: IntArray
     """(n,) Number of the frame name. Equal names have equal numbers; -1 if not decoded."""
+
+
+class PoseArrays(NamedTuple):
+    """Contents of geometry_msgs/PoseStamped messages, as `FieldArrays`; messages in another frame
+    are not decoded either."""
+
+    is_decoded: BoolArray
+    stamp_ns: IntArray
+    pose: FloatArray
+    """(n, 7) Position [m] and quaternion xyzw."""
 
 
 def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldArrays:
@@ -49,17 +58,12 @@ def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldAr
                        known_covariances(numbers[:, 3:].reshape(-1, 3, 3)), frames)
 
 
-def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str
-          ) -> tuple[BoolArray, IntArray, FloatArray]:
-    """Decode geometry_msgs/PoseStamped messages, which are `content[begins[i]:ends[i]]` in CDR.
-
-    Return (whether a message was decoded (n,), as in `FieldArrays`, and not if it is in another
-    frame; its timestamp (n,) [ns]; position [m] and quaternion xyzw (n, 7)).
-    """
+def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseArrays:
+    """Decode geometry_msgs/PoseStamped messages of a frame, `content[begins[i]:ends[i]]` in CDR."""
     stamped = _StampedMessages(content, begins, ends, _POSE_DOUBLES)
     rows = np.flatnonzero(stamped.is_decoded)
     stamped.is_decoded[rows] = stamped.have_frame(rows, frame)
-    return stamped.is_decoded, stamped.stamp_ns, stamped.numbers()
+    return PoseArrays(stamped.is_decoded, stamped.stamp_ns, stamped.numbers())
 
 
 class _StampedMessages:

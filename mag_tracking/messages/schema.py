@@ -223,8 +223,7 @@ def readings_of(message: FieldReadings) -> records.Readings:
 def acceleration_dict(sample: records.AccelerationSample, frame: str) -> MessageDict:
     """Convert an `AccelerationSample` to sensor_msgs/Imu.
 
-    Orientation and angular velocity are marked as not provided; the covariance of the acceleration
-    is zero, which means unknown.
+    Orientation and angular velocity are not provided; a zero covariance means unknown.
     """
     not_provided = [-1.0] + 8 * [0.0]
     return {'header': header_dict(sample.stamp_ns, frame),

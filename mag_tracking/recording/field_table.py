@@ -35,8 +35,7 @@ _DECIMALS = {'ms': 3, 'us': 6, 'ns': 9}
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Properties of a table that the user states, as the options of `mag-tracking import`; empty
-    ones are found from the table."""
+    """Options of `mag-tracking import`; empty ones are found from the table."""
 
     columns: Sequence[str] = ()
     unit: str = ''

@@ -66,8 +66,7 @@ def _values(path: FilePath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
 
 def import_pose_table(table: FilePath, background: FilePath, out: FilePath,
                       noise_std: float) -> tuple[Path, Path, int]:
-    """Import a table of magnet poses and sensor fields; return recording, network file and row
-    count.
+    """Import a table of magnet poses and fields; return recording, network file and row count.
 
     `table` has one row per sensor and pose: `id`, `timestamp` [s], `Bx By Bz` [µT, sensor frame,
     including the background], `sensor_x..z` [mm], `sensor_ox..oz` (rotation vector, sensor to

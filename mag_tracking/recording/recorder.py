@@ -35,9 +35,8 @@ class Recorder(AbstractContextManager['Recorder']):
     A new file begins after `split_bytes` or `split_ns`. While the disk is full, messages are
     dropped and reported, and a new file is attempted every `retry_ns`. `counts` and `dropped` are
     numbers of messages by topic, `repeated` that of latched messages at the starts of files, which
-    makes these self-contained; `unfinished` files have no index. `opener` creates a file and
-    returns an unbuffered stream. Raises OutputError if the folder contains a recording or cannot be
-    written.
+    makes these complete; `unfinished` files have no index. `opener` creates a file and returns an
+    unbuffered stream. Raises OutputError if the folder contains a recording or cannot be written.
     """
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,

@@ -47,8 +47,7 @@ class TopicFindings(NamedTuple):
     """Properties of the topics of sensors."""
 
     unstamped: frozenset[str]
-    """Topics whose first two messages have the timestamp 0. One such message may be the first of
-    a simulation."""
+    """Topics whose first two timestamps are 0. A single one may be the start of a simulation."""
     dated: frozenset[str]
     """Topics with timestamps since 1970, on which the timestamp 0 is missing. The timestamps of a
     simulation begin at 0."""
@@ -104,8 +103,7 @@ class FrameCheck:
         self.numbers: dict[str, int] = {}
 
     def check(self, topic: str, frame: str, number: int = -1) -> None:
-        """Check the frame of a reading, and store its number; raises RecordingError if the topic
-        alternates between frames."""
+        """Store the frame of a reading; raises RecordingError if the topic alternates."""
         self.numbers[topic] = number
         frames = self._frames.setdefault(topic, [frame])
         if frame == frames[-1]:

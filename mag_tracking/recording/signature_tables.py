@@ -130,8 +130,7 @@ def _read_by_row(table: CsvTable) -> list[Signature]:
 
 
 class _Fields:
-    """Field columns of a table by axis, from `columns`: [(axis, unit, names)]; raises LabelsError
-    if they are inconsistent."""
+    """Field columns of a table, [(axis, unit, names)]; raises LabelsError if inconsistent."""
 
     def __init__(self, path: FilePath, columns: list[tuple[str, str, list[str]]]) -> None:
         columns = sorted(columns)

@@ -85,8 +85,7 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
                header_unit: str, order: str) -> Times:
     """Convert the times of a table, whose series (sensors) are `keys`.
 
-    An empty `unit` or `order` of a date is found; if it is ambiguous, RecordingError names the
-    option that states it.
+    An empty `unit` or `order` of a date is found; if ambiguous, RecordingError names the option.
     """
     if order and order not in units.DATE_ORDERS:
         raise SettingsError(f'--date-order: expected one of {", ".join(units.DATE_ORDERS)}, got '

@@ -29,8 +29,7 @@ _QUATERNION, _MOMENT = ('qx', 'qy', 'qz', 'qw'), ('mx', 'my', 'mz')
 class TruthTopics:
     """Collects true poses from `topic`, or all topics below `prefix`.
 
-    Poses in other frames than the world frame of the network cannot be compared; they are counted
-    in `rejected`, by cause.
+    Poses in another frame than the world frame of the network are counted in `rejected`, by cause.
     """
 
     def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:

@@ -291,8 +291,7 @@ class RecordingWriter(AbstractContextManager['RecordingWriter']):
     def write(self, topic: str, type_name: str, message: MessageDict, time_ns: int) -> None:
         """Append a message with its fields and log time.
 
-        Raises RecordingError if the definition of the type is unknown, OutputError beyond
-        `MAX_TOPICS`.
+        Raises RecordingError if the type is unknown, OutputError beyond `MAX_TOPICS`.
         """
         if topic not in self._topics:
             if len(self._topics) == MAX_TOPICS:

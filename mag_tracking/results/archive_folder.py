@@ -137,9 +137,8 @@ def _hash(text: str) -> str:
 class ArchiveFolder(AbstractContextManager['ArchiveFolder']):
     """Folder of an archive, locked against other runs until it is closed; a context manager.
 
-    `head` is metadata that must be identical in all runs that write to the folder. Raises
-    OutputError if the folder is neither empty nor an archive, has other metadata or another table
-    version, or is locked.
+    `head` is metadata that must be identical in all runs. Raises OutputError if the folder is
+    neither empty nor an archive, has other metadata or another table version, or is locked.
     """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -236,9 +235,8 @@ class ArchiveFolder(AbstractContextManager['ArchiveFolder']):
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  summary: Mapping[str, Any]) -> None:
-        """Mark a recording as processed, after all of its tables are written, and remove `work`;
-        `state` is that of the beginning, so that a recording that has changed meanwhile is
-        processed again."""
+        """Mark a recording, whose tables are written, as processed, and remove `work`; `state` is
+        that of the beginning, so that a recording that has changed meanwhile is processed again."""
         replace_text(self.path / _DONE / f'{recording_key(recording)}.json',
                      json.dumps({**summary, 'state': state}, indent=1) + '\n')
         _remove(work)

@@ -3,8 +3,7 @@
 Each reading starts a conversion. The timestamp is the middle of the conversion, 3 ms after the
 start, with an uncertainty of about 1 ms.
 
-Axes: as drawn in the data sheets, right-handed. The order of the registers is X, Z, Y. An axis over
-its range is NaN.
+Axes: as drawn in the data sheets, right-handed, in registers X, Z, Y; NaN over the range.
 
 Scale: 73, 92, 122, 152, 227, 256, 303, 435 nT per count for ranges of ±88, 130, 190, 250, 400, 470,
 560, 810 µT. The noise is about 200 nT. The offset may be tens of microtesla and drifts with
@@ -54,8 +53,7 @@ class Hmc5883l(chip.Chip):
     IDENTITY = ((0x0A, ord('H')), (0x0B, ord('4')), (0x0C, ord('3')))
     NAME = 'hmc5883l'
     CONFIGURATION = 0x10
-    """Configuration register A: one sample per measurement, no bias. The rate of 15 Hz does not
-    affect single measurements."""
+    """Configuration register A: one sample per measurement, no bias; the rate has no effect."""
 
     def __init__(self, registers: chip.Registers, settings: Hmc5883lSettings,
                  count: Callable[[str], None]) -> None:

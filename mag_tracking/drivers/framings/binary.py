@@ -96,8 +96,7 @@ class BinaryFraming:
     or in a payload begins a false frame, which is accepted with probability 2^-n and hides the true
     frames that begin within it. Without a checksum, every sync is accepted; a tail is a weak
     checksum. True frames are then found if they follow each other without a gap, or if the gap
-    contains no sync. After any other gap, readings may be false or lost until the search is aligned
-    again.
+    contains no sync. After any other gap, readings may be false or lost until it is aligned again.
     """
 
     SETTINGS = BinarySettings

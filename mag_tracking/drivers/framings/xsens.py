@@ -103,8 +103,7 @@ def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | Axes | No
 
 
 def read_mtdata2(data: bytes) -> DecodedMessage | None:
-    """Decode DATA of an MTData2 message; None if the packets do not fill it, or a used one has an
-    invalid length.
+    """Decode DATA of an MTData2 message; None if a packet has a wrong length.
 
     A packet is an identifier (u16), the length of its data (u8), and the data. SampleTimeCoarse
     (0x1070) is too coarse for a clock.
@@ -259,9 +258,8 @@ class XsensFraming:
 
     A reading has the field in arbitrary units (1 is the magnitude of the field where Xsens
     calibrated the sensor), the acceleration in m/s², the packet counter as sequence (modulo 2^16),
-    and SampleTimeFine as ticks (10 kHz). Quantities that the device does not send are None. A
-    message with neither field nor acceleration is counted, and its sequence number is counted as
-    lost.
+    and SampleTimeFine as ticks (10 kHz). Quantities that are not sent are None. A message with
+    neither field nor acceleration is counted, and its sequence number is counted as lost.
     """
 
     SETTINGS = XsensSettings
