@@ -188,16 +188,11 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
             with new_binary_file(f'{path}.cut') as cut:
                 shutil.copyfileobj(stream, cut)
         _replace_end(raw, scan.end, scan.index())
-    lines = [f'{path.name}: index written; messages: {scan.counts.total()}']
-    if n_cut:
-        lines.append(f'{path.name}: the incomplete end was moved to {path.name}.cut; bytes: '
-                     f'{n_cut}')
-    if scan.n_from_cut_chunk:
-        lines.append(f'{path.name}: messages recovered from the incomplete chunk at the end: '
-                     f'{scan.n_from_cut_chunk}')
-    if scan.damaged:
-        lines.append(f'{path.name}: damaged chunks skipped: {scan.damaged}')
-    return lines
+    details = {f'the incomplete end was moved to {path.name}.cut; bytes': n_cut,
+               'messages recovered from the incomplete chunk at the end': scan.n_from_cut_chunk,
+               'damaged chunks skipped': scan.damaged}
+    return [f'{path.name}: index written; messages: {scan.counts.total()}',
+            *(f'{path.name}: {text}: {n}' for text, n in details.items() if n)]
 
 
 def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:

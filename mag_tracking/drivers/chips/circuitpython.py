@@ -151,9 +151,8 @@ class CircuitpythonChip(Chip):
     def _property_name(self) -> str:
         # A look at the property of the instance would start a measurement.
         members = {*dir(type(self._driver)), *getattr(self._driver, '__dict__', ())}
-        for name in PROPERTIES:
-            if name in members:
-                return name
+        if found := [name for name in PROPERTIES if name in members]:
+            return found[0]
         raise DeviceError(f'the class has none of the properties {", ".join(PROPERTIES)}')
 
     def _enable_report(self, report: int) -> None:

@@ -183,14 +183,13 @@ class UdpSocket(Polled[socket.socket]):
 
     def _accept(self, data: bytes, flags: int, ip: str) -> bool:
         if not self._any_source and ip not in self._sources:
-            self.counts['datagrams from other sources'] += 1
+            cause = 'datagrams from other sources'
         elif flags & socket.MSG_TRUNC:
-            self.counts['datagrams longer than max_length'] += 1
-        elif not data:
-            self.counts['empty datagrams'] += 1
+            cause = 'datagrams longer than max_length'
         else:
-            return True
-        return False
+            cause = '' if data else 'empty datagrams'
+        self.counts.update([cause] if cause else [])
+        return not cause
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
         """Monotonic arrival time of a datagram, ns, from the timestamp in `ancillary`; `woken_ns`
