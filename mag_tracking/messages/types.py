@@ -148,15 +148,6 @@ def referenced_types(message_definition: str, package: str) -> list[str]:
         if field and not field['is_constant'] and field['type'] not in _BUILT_IN))
 
 
-def _dependencies(type_name: str) -> list[str]:
-    """Types contained in `type_name` at any depth, without duplicates, in breadth-first order."""
-    found = [type_name]
-    for name in found:
-        found += [n for n in referenced_types(DEFINITIONS[name], name.partition('/')[0])
-                  if n not in found]
-    return found[1:]
-
-
 def _own_definition(type_name: str) -> str:
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
@@ -165,8 +156,11 @@ def _own_definition(type_name: str) -> str:
 
 def definition(type_name: str) -> str:
     """Definition of a type and of all types it contains, in the format of a `ros2msg` schema."""
-    message_definition = _own_definition(type_name)
-    for name in _dependencies(type_name):
+    message_definition, found = _own_definition(type_name), [type_name]
+    for name in found:
+        found += [n for n in referenced_types(DEFINITIONS[name], name.partition('/')[0])
+                  if n not in found]
+    for name in found[1:]:
         package, _, leaf = name.split('/')
         message_definition += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
     return message_definition

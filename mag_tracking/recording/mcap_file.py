@@ -7,7 +7,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -16,7 +16,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.records import Channel, Schema, Statistics
 from mcap.summary import Summary
 
 from mag_tracking.arrays import IntArray
@@ -200,9 +200,13 @@ class McapFile(RecordingFile):
             self._channels.add(channel)
         statistics = summary.statistics
         indexed = sorted(summary.chunk_indexes, key=lambda entry: entry.chunk_start_offset)
-        # A summary may omit channels and schemas; they are then read from the chunks.
+        ends = [len(MAGIC), *(entry.chunk_start_offset + entry.chunk_length for entry in indexed)]
+        # A summary may omit channels and schemas; they are then read from the chunks. Those of a
+        # valid index lie in the file, one after the other.
         if len(self._channels.kinds) < (statistics.channel_count if statistics else 1) \
-                or not _is_valid(indexed, file_size(stream)):
+                or ends[-1] > file_size(stream) or any(
+                    entry.chunk_start_offset < end
+                    for entry, end in zip(indexed, ends, strict=False)):
             indexed = []
         position = len(MAGIC)
         for entry in indexed:
@@ -328,13 +332,6 @@ class McapFile(RecordingFile):
         self._count_loss(part.record.begin, f'damaged segments ({self._path.name}, '
                          f'{duration_s:.1f} s long, {start_s:.1f} s after the start'
                          f'{_reason(error)})')
-
-
-def _is_valid(index: Sequence[ChunkIndex], size: int) -> bool:
-    """Whether the chunks of an index lie in a file of `size` bytes, one after the other."""
-    ends = [len(MAGIC), *(entry.chunk_start_offset + entry.chunk_length for entry in index)]
-    return ends[-1] <= size and all(
-        entry.chunk_start_offset >= end for entry, end in zip(index, ends, strict=False))
 
 
 def _reason(error: Exception) -> str:

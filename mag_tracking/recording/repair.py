@@ -1,7 +1,6 @@
 """Repair of recordings that a crash or a full disk has truncated, by writing the missing index."""
 
 import fcntl
-import io
 import shutil
 import struct
 import zlib
@@ -66,7 +65,12 @@ class _Scan:
                 self._drop_index()
             # The message indexes of a damaged chunk are not used.
             self._is_damaged = True
-            self._add_chunk(record)
+            header = mcap_file.chunk_header(self._stream, record)
+            data = mcap_file.chunk_content(self._stream, record, self._limit)
+            self._rows, _ = self._add_content(data)
+            self.chunks.append(ChunkIndex(
+                record.end - record.begin, record.begin, header.compression, header.size,
+                header.end_ns, 0, {}, header.start_ns, len(data)))
             self._is_damaged = False
         elif record.opcode in mcap_file.CONTENT:
             self._stream.seek(record.begin)
@@ -91,14 +95,6 @@ class _Scan:
             times = (*self.times, int(rows[:, 1].min()), int(rows[:, 1].max()))
             self.times = [min(times), max(times)]
         return rows, end
-
-    def _add_chunk(self, record: mcap_file.Record) -> None:
-        header = mcap_file.chunk_header(self._stream, record)
-        data = mcap_file.chunk_content(self._stream, record, self._limit)
-        self._rows, _ = self._add_content(data)
-        self.chunks.append(ChunkIndex(
-            record.end - record.begin, record.begin, header.compression, header.size,
-            header.end_ns, 0, {}, header.start_ns, len(data)))
 
     def _recover_chunk(self, record: mcap_file.Record) -> None:
         """Write the complete records at the beginning of a cut chunk as a new chunk."""
@@ -187,23 +183,19 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
             stream.seek(scan.end)
             with new_binary_file(f'{path}.cut') as cut:
                 shutil.copyfileobj(stream, cut)
-        _replace_end(raw, scan.end, scan.index())
+        index = scan.index()
+        raw.truncate(scan.end)
+        raw.seek(scan.end)
+        try:
+            writer.UnbufferedWriter(raw).write(index)
+        except OSError:
+            raw.truncate(scan.end)
+            raise
     details = {f'the incomplete end was moved to {path.name}.cut; bytes': n_cut,
                'messages recovered from the incomplete chunk at the end': scan.n_from_cut_chunk,
                'damaged chunks skipped': scan.damaged}
     return [f'{path.name}: index written; messages: {scan.counts.total()}',
             *(f'{path.name}: {text}: {n}' for text, n in details.items() if n)]
-
-
-def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
-    """Write the index after the intact records; on OSError, remove the incomplete index."""
-    raw.truncate(end)
-    raw.seek(end)
-    try:
-        writer.UnbufferedWriter(raw).write(index)
-    except OSError:
-        raw.truncate(end)
-        raise
 
 
 def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
