@@ -30,23 +30,14 @@ from mag_tracking.errors import DeviceError
 TIMEOUT_NS = 250_000_000
 """[ns] Timeout of one measurement. Creating the driver instance may take ten times as long."""
 UNITS = {
-    'adafruit_bno055.BNO055_I2C': 'uT',
-    'adafruit_bno08x.i2c.BNO08X_I2C': 'uT',
-    'adafruit_fxos8700.FXOS8700': 'uT',
-    'adafruit_icm20x.ICM20948': 'uT',
-    'adafruit_lis2mdl.LIS2MDL': 'uT',
-    'adafruit_lis3mdl.LIS3MDL': 'uT',
-    'adafruit_lsm303agr_mag.LSM303AGR_Mag': 'uT',
-    'adafruit_lsm303dlh_mag.LSM303DLH_Mag': 'uT',
-    'adafruit_lsm9ds0.LSM9DS0_I2C': 'G',
-    'adafruit_lsm9ds1.LSM9DS1_I2C': 'G',
-    'adafruit_mlx90393.MLX90393': 'uT',
-    'adafruit_mlx90395.MLX90395': 'uT',
-    'adafruit_mmc56x3.MMC5603': 'uT',
-    'adafruit_qmc5883p.QMC5883P': 'G',
-    'adafruit_tlv493d.TLV493D': 'uT',
-    'adafruit_tmag5273.TMAG5273': 'uT',
-    'qmc5883l.QMC5883L': 'G',
+    'adafruit_bno055.BNO055_I2C': 'uT', 'adafruit_bno08x.i2c.BNO08X_I2C': 'uT',
+    'adafruit_fxos8700.FXOS8700': 'uT', 'adafruit_icm20x.ICM20948': 'uT',
+    'adafruit_lis2mdl.LIS2MDL': 'uT', 'adafruit_lis3mdl.LIS3MDL': 'uT',
+    'adafruit_lsm303agr_mag.LSM303AGR_Mag': 'uT', 'adafruit_lsm303dlh_mag.LSM303DLH_Mag': 'uT',
+    'adafruit_lsm9ds0.LSM9DS0_I2C': 'G', 'adafruit_lsm9ds1.LSM9DS1_I2C': 'G',
+    'adafruit_mlx90393.MLX90393': 'uT', 'adafruit_mlx90395.MLX90395': 'uT',
+    'adafruit_mmc56x3.MMC5603': 'uT', 'adafruit_qmc5883p.QMC5883P': 'G',
+    'adafruit_tlv493d.TLV493D': 'uT', 'adafruit_tmag5273.TMAG5273': 'uT', 'qmc5883l.QMC5883L': 'G',
     'rm3100.RM3100_I2C': 'uT'}
 """{module.Class: unit of its field}."""
 PROPERTIES = ('magnetic', 'magnetometer')
