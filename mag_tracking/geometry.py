@@ -30,7 +30,7 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Rotation vectors (..., 3) [rad], world axes, from orientation `q` (4,) to others (..., 4)."""
+    """Shortest rotation vectors (..., 3) [rad], world axes, from `q` (4,) to others (..., 4)."""
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
     along = other[..., 3:] * v + w * other[..., :3] + np.cross(other[..., :3], v)
@@ -129,7 +129,7 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Heading from x and its std [rad], 0 and inf at rest, of a velocity with 2 or 3 components."""
+    """Heading anticlockwise from x and std [rad], 0 and inf at rest, of a velocity (2,) or (3,)."""
     vx, vy = velocity[:2]
     if vx == vy == 0.0:
         return 0.0, float('inf')

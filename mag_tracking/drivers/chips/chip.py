@@ -124,7 +124,7 @@ Measurement: TypeAlias = Generator[float, None, Conversion | None]
 class Chip:
     """Magnetometer chip.
 
-    Creating one does not access the bus. `count` is called for each loss, with a plural cause.
+    Creating one does not access the bus. `count` is called with the plural cause of each loss.
     """
 
     NAME = ''
