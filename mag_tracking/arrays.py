@@ -6,11 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
-"""Array of float64."""
 IntArray: TypeAlias = NDArray[np.int64]
-"""Array of int64."""
 BoolArray: TypeAlias = NDArray[np.bool_]
-"""Array of bool."""
 StructArray: TypeAlias = NDArray[np.void]
 """Structured array: one record per element."""
 Record: TypeAlias = Any

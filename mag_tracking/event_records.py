@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from mag_tracking.arrays import FloatArray
 
 SIGNATURE_SPAN = 4.0
-"""Half the duration of a signature, in units of `PassEvent.time_scale`. A signature is centred on
-the closest point of approach."""
+"""Half the duration of a signature about the closest point, in units of `PassEvent.time_scale`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,16 +58,14 @@ class Disturbance:
     """Time at which the disturbance was identified or, if `ended`, at which it ended."""
     id: int
     ended: bool
-    """True if the network is quiet again or the frames have ended. False while the disturbance
-    continues."""
+    """True if the network is quiet again or the frames have ended; False while it continues."""
     begin_ns: int
     largest: float
     """Largest magnitude of the field at any sensor, T."""
     sensors: tuple[str, ...]
     """Names of the affected sensors, in descending order of the field magnitude."""
     uniform: float
-    """Probability of one common field across the network, as opposed to an independent field at
-    each sensor."""
+    """Probability of one common field across the network, as opposed to one at each sensor."""
     track_id: int
     """Number of the latest track that the disturbance has made ambiguous."""
 
@@ -87,13 +84,11 @@ class VehiclePassage:
     """Whether the vehicle moved in the forward direction of the line."""
     direction_error: float
     """Probability that the direction is wrong, from the rotation of the field at each sensor near
-    the path, independently of the track. NaN if the rotation is inconclusive or another vehicle was
-    nearby."""
+    the path, independently of the track. NaN if inconclusive or another vehicle was nearby."""
     position: FloatArray
     """Position of the crossing, (3,) m, world frame."""
     lateral: float
-    """Distance of `position` from the middle of the line, m. Positive to the left of the forward
-    direction."""
+    """Distance of `position` from the middle of the line, m. Positive to the left when forward."""
     velocity: FloatArray
     """Velocity, (3,) m/s, world frame."""
     speed: float

@@ -17,15 +17,13 @@ from mag_tracking.errors import MagTrackingError, OutputError
 MAX_NODES = 1_000_000
 """Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
 MAX_ENTRIES = 1000
-"""Maximum number of entries of a mapping, such as the sensors of a network. The parser needs half a
-minute for 10,000 sensors."""
+"""Maximum number of entries of a mapping. The parser needs half a minute for 10,000 sensors."""
 MAX_BYTES = 2_000_000
 """Maximum size of a file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
 MAX_DEPTH = 64
 """Maximum depth of lists and mappings after expansion of aliases."""
 MAX_BITS = 14_000
-"""Maximum size of an integer [bits]. Python does not format integers of more than 4300 decimal
-digits."""
+"""Maximum size of an integer [bits]. Python does not format more than 4300 decimal digits."""
 _REPR = Repr()
 _REPR.maxlevel, _REPR.maxstring, _REPR.maxother, _REPR.maxlong = 3, 200, 200, 200
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = 20
@@ -97,7 +95,6 @@ def write_json(path: str | PathLike[str], value: Any) -> None:
 
 
 def _without_nan(value: Any) -> Any:
-    """Replace NaN and infinity by None in a copy of nested dicts and lists; tuples become lists."""
     if isinstance(value, dict):
         return {k: _without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -186,7 +183,6 @@ def _check_size(root: yaml.Node) -> None:
 
 
 def _children(node: yaml.Node) -> list[yaml.Node]:
-    """Child nodes of a node, including keys."""
     if isinstance(node, yaml.MappingNode):
         return [child for pair in node.value for child in pair]
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []

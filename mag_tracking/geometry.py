@@ -30,8 +30,7 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors (..., 3)
-    [rad] in world axes."""
+    """Shortest rotation vectors (..., 3) [rad], world axes, from `q` (4,) to others (..., 4)."""
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
     along = other[..., 3:] * v + w * other[..., :3] + np.cross(other[..., :3], v)
@@ -57,8 +56,7 @@ def cross_matrix(a: ArrayLike) -> FloatArray:
 def left_jacobian(v: ArrayLike) -> FloatArray:
     """Left Jacobian J (..., 3, 3) of SO(3) at rotation vectors `v` (..., 3) [rad].
 
-    To first order R(v + d) = R(J d) R(v); J is the identity at v = 0. See [Sola18]_, appendix on
-    SO(3).
+    To first order R(v + d) = R(J d) R(v); J is the identity at v = 0. See [Sola18]_, SO(3).
     """
     v = np.asarray(v, dtype=float)
     square = np.einsum('...i,...i->...', v, v)[..., None, None]
@@ -86,15 +84,13 @@ def rotation_about_z(angle: float) -> FloatArray:
 
 
 def yaw_between(R: FloatArray, other: FloatArray) -> float:
-    """Rotation about the world z axis, in [-pi, pi] rad, that brings orientation `R` closest to
-    `other`."""
+    """Rotation about the world z axis, in [-pi, pi] rad, that brings `R` closest to `other`."""
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Unit quaternion (4,) of a rotation matrix, numerically stable, with a positive largest
-    component."""
+    """Unit quaternion (4,) of a rotation matrix, whose largest component is positive."""
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
     k = int(np.argmax(w2))
@@ -124,8 +120,7 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Speed and its std, at zero the largest in any direction, of a velocity (d,) with covariance
-    (d, d)."""
+    """Speed and std (at 0 the largest in any direction) of a velocity (d,), covariance (d, d)."""
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
         return 0.0, float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
@@ -134,8 +129,7 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Heading anticlockwise from x and its std [rad], at zero speed 0 and inf, of a velocity with
-    two or three components."""
+    """Heading anticlockwise from x and std [rad], 0 and inf at rest, of a velocity (2,) or (3,)."""
     vx, vy = velocity[:2]
     if vx == vy == 0.0:
         return 0.0, float('inf')

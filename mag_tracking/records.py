@@ -27,8 +27,7 @@ def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]:
 
 
 def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
-    """Return a C-contiguous, writable array that compiled code accepts: `values` itself or a
-    copy."""
+    """C-contiguous, writable array that compiled code accepts: `values` itself or a copy."""
     # Most arrays meet the requirements, and this check takes a fifth of the time of `np.require`.
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.carray:
         return values

@@ -45,10 +45,8 @@ if TYPE_CHECKING:
 
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
-"""Type of the value of a setting."""
 USER, EXPERT = 'user', 'expert'
-"""Levels: settings that describe the site, the targets and the wanted results; and settings of the
-methods, which rarely change."""
+"""Levels: settings of the site, the targets and the wanted results, and of the methods."""
 _ROW_NAME = re.compile(r'(?!names$)\w[\w -]*')
 """Permitted names of the rows of a table."""
 _Class: TypeAlias = type[object]
@@ -98,12 +96,10 @@ class Parameter:
 
 
 def _is_group(value: object) -> 'TypeGuard[DataclassInstance]':
-    """Whether the value of a field is itself a group of settings."""
     return dataclasses.is_dataclass(value)
 
 
 def _is_table(value: object) -> 'TypeGuard[tuple[Any, ...]]':
-    """Whether the value of a field is a table of settings."""
     return isinstance(value, tuple) and any(map(_is_group, value))
 
 
@@ -128,7 +124,6 @@ def flatten(settings: 'DataclassInstance', prefix: str = '', row: str = '') -> l
 
 
 def _scalar(name: str, value: object, kind: _Class) -> Scalar:
-    """Check a scalar and convert it to `kind`; raises a SettingsError that names the setting."""
     if isinstance(value, int) and value.bit_length() > 1000:
         raise SettingsError(f'{name}: an integer of {value.bit_length()} bits is too large; the '
                             'maximum is 1000 bits')
@@ -145,7 +140,6 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
 
 
 def _validated(p: Parameter, value: object) -> Value:
-    """Convert `value` to the declared type of `p`; raises SettingsError if it is invalid."""
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
@@ -186,7 +180,6 @@ def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
 
 
 def _merge(out: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Merge `more` into `out`; raises SettingsError if a setting has two different values."""
     for name, value in more.items():
         if out.setdefault(name, value) is not value and out[name] != value:
             raise SettingsError(f'{name} is given twice, as {short_repr(out[name])} and as '
@@ -248,7 +241,6 @@ def _suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def _group_suggestion(group: str, leaf: str, names: Iterable[str]) -> str:
-    """Suggestion for the setting `leaf` of an unknown group; empty if there are no groups."""
     groups = list(dict.fromkeys(k[:i] for k in names for i, c in enumerate(k) if c == '.'))
     closest_group = closest_name(group, groups)
     if closest_group:
@@ -267,7 +259,6 @@ def closest_name(name: str, candidates: Iterable[str]) -> str:
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:
-    """Copy a settings tree with the validated values inserted."""
     changes: dict[str, Any] = {}
     for f in dataclasses.fields(settings):
         name, value = prefix + f.name, getattr(settings, f.name)
@@ -385,7 +376,6 @@ def to_yaml(settings: 'DataclassInstance', level: str = '') -> str:
 
 
 def _comment(p: Parameter) -> str:
-    """Description of a setting with its unit, range and choices."""
     notes = [p.unit, f'{p.range[0]} .. {p.range[1]}' if p.range else '', ', '.join(p.choices),
              'live' if p.live else '']
     return p.doc + (f' [{"; ".join(filter(None, notes))}]' if any(notes) else '')

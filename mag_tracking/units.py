@@ -46,16 +46,14 @@ _PER_COUNT = re.compile(rf'([+-]?){_NUMBER}\s*([^\s/0-9.]+)(?:\s*(?:/|\bper\b)\s
 
 
 def field_unit(text: str) -> str | None:
-    """Key of `FIELD_UNITS` that a text names in any usual spelling ('µT', 'uT', '[nT]',
-    'Gauss')."""
+    """Key of `FIELD_UNITS` that a text names in any usual spelling ('µT', '[nT]', 'Gauss')."""
     name = _plain_name(text)
     # 'MT' is not millitesla, and 'MG' is not milligauss.
     return None if name[:1] == 'M' and len(name) == 2 else _FIELD_OF.get(name.lower())
 
 
 def time_unit(text: str) -> str | None:
-    """Key of `TIME_UNITS` that a text names in any usual spelling, such as 'ms', 'millis' or
-    'µs'."""
+    """Key of `TIME_UNITS` that a text names in any usual spelling ('ms', 'millis', 'µs')."""
     return _TIME_OF.get(_plain_name(text).lower())
 
 
@@ -131,7 +129,6 @@ FORMS = ('2026-05-03T23:56:01.250Z (ISO 8601), 2026-05-03 23:56:01.250, 03.05.20
 MAX_LENGTH = 80
 """Maximum length of a time."""
 DAY_NS = 86400 * NS
-"""Nanoseconds per day."""
 _MONTHS = {name: k + 1 for k, name in enumerate(
     'jan feb mar apr may jun jul aug sep oct nov dec'.split())}
 _SEPARATED = r'([0-9]{1,4})([-/. ])\s?([0-9]{1,2})\2\s?([0-9]{1,4})'
@@ -153,8 +150,7 @@ _TIME = re.compile(r'''(?:(?P<days>[0-9]+)\s*days?,?\s+)?
 
 
 def parse_time(text: str, order: str = 'dmy') -> tuple[int, bool, bool]:
-    """Convert a date and time (ns since 1970), or a time of day (ns since midnight), to
-    nanoseconds.
+    """Convert a date and time to ns since 1970, or a time of day to ns since midnight.
 
     Return also whether there is a date, and whether there is a zone: Z, UTC, GMT or an offset.
     Without it, the zone is UTC. `order`, a value of `DATE_ORDERS`, applies to a date of three

@@ -19,7 +19,7 @@ BUDGETS = {
     'cli': 3100, 'nodes': 3590, 'apps': 6110, 'results': 1450, 'drivers': 5400, 'recording': 4500,
     'web': 570, 'stages': 9880, 'analysis': 3000, 'messages': 1550, 'simulation': 250,
     'physics': 2450, 'inference': 3100, 'calibration': 5500, 'network': 850, 'report': 960,
-    'modules': 2900}
+    'modules': 2530}
 """Maximum lines of each package, and of the modules outside packages, in Python and C++ with
 docstrings. A change may lower a budget; one that raises it says why."""
 

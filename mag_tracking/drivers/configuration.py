@@ -44,10 +44,8 @@ KINDS = {
     'device': {'i2c': f'{_PACKAGE}.transports.i2c:I2cDevice',
                'simulator': f'{_PACKAGE}.simulated_device:SimulatedDevice'},
 }
-"""Class of each kind of transport, framing and device."""
 REQUIRED_MEMBERS = {'transport': ('is_message_oriented', 'open', 'read', 'close'),
                     'framing': ('parse',), 'device': ('open', 'read', 'close')}
-"""Members that the class of a transport, framing or device must have besides `SETTINGS`."""
 _ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
 """Keys of a device other than the driver settings and the groups of its kinds."""
 _NAME_PATTERN = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
@@ -112,7 +110,6 @@ def driver_of(name: object, entry: object) -> Driver:
 
 
 def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
-    """Create the device of an entry; remove its settings from `options`."""
     if 'device' in options:
         if 'transport' in options or 'framing' in options:
             raise SettingsError('device cannot be combined with transport or framing; remove '
@@ -199,7 +196,6 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
 
 
 def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> None:
-    """Raise SettingsError if a sensor is assigned twice, or is not in the network."""
     owner: dict[str, str] = {}
     for driver in drivers:
         for key, sensor in driver.sensors.items():
@@ -215,7 +211,6 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
 
 
 def _names(settings: Any) -> set[str]:
-    """Names of the settings and groups of a settings dataclass."""
     return {field.name for field in dataclasses.fields(settings)}
 
 
@@ -227,7 +222,6 @@ def _groups_of(name: object) -> list[str]:
 
 
 def _joined(groups: Collection[str]) -> str:
-    """Join names for a message, such as 'serial, udp or mqtt'."""
     *others, last = groups
     return f'{", ".join(others)} or {last}' if others else last
 

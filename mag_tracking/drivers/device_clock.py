@@ -27,7 +27,6 @@ from mag_tracking.settings import param
 from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
 
 Point: TypeAlias = tuple[float, float]
-"""Coordinates (x, y) of a point."""
 
 
 def lower_hull(points: Sequence[Point]) -> list[Point]:
@@ -185,7 +184,6 @@ class _StandingClock:
 
 
 def _advice(ticks: float, tick_ns: float) -> str:
-    """What to change for a device time that is not plausible."""
     unit = unit_since_1970(ticks)
     if isinstance(ticks, DeviceDate) or unit and TIME_UNITS[unit] == tick_ns:
         return f'{ticks:.15g}: send decimals of the second, or set stamp_by: arrival'
@@ -286,7 +284,6 @@ class DeviceClock:
             t, elapsed - t, detrended, arrival_ns)
 
     def _count(self, cause: str, ticks: float) -> None:
-        """Count a reading, and store the first one as an example."""
         if cause not in self.examples:
             self.examples = {**self.examples, cause: _advice(ticks, self._tick_ns)}
         self.counts[cause] += 1

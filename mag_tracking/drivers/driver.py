@@ -37,7 +37,6 @@ _AXES_STRUCT = struct.Struct('3d')
 PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """Fields and accelerations received by one poll."""
 EMPTY_RESULT: PollResult = Readings.joined([]), ()
-"""Result of a poll without data."""
 MIN_CLOCK_STEP_NS = 10_000_000
 """[ns] A larger change of wall clock minus monotonic clock is counted as a clock step."""
 
@@ -85,8 +84,7 @@ class Driver:
 
     @property
     def fault(self) -> str:
-        """Message of the latest failure, or, if data have arrived since, the sensors whose readings
-        are sent by several sources."""
+        """Latest failure, or, if data have arrived since, the sensors with several sources."""
         return self._failure or self._contest
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
@@ -117,8 +115,7 @@ class Driver:
     def poll(self, timeout_s: float) -> PollResult:
         """Return the samples received since the last call; wait for data for at most `timeout_s`.
 
-        Device errors are not raised but stored in `fault`. Raises ValueError if a field does not
-        consist of three numbers.
+        Device errors are stored in `fault`. Raises ValueError if a field is not three numbers.
         """
         if not self.is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
@@ -171,7 +168,6 @@ class Driver:
         self._schedule_retry(f'{type(error).__name__}: {error}')
 
     def _try_to_open(self, timeout_s: float) -> bool:
-        """Open the device if the retry interval has elapsed; return whether it is open."""
         if self._retry_ns is not None:
             wait_s = (self._retry_ns - self._monotonic_ns()) / 1e9
             if wait_s > 0.0:
@@ -208,7 +204,6 @@ class Driver:
         return offset
 
     def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> PollResult:
-        """Convert arrivals to samples."""
         sensors: list[str] = []
         stamps: list[int] = []
         fields: list[Axes] = []
@@ -260,7 +255,6 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, reported_name: str, source: str) -> str | None:
-        """Network name of a sensor; None if ignored or unknown."""
         sensor = next((self.sensors[name] for name in (reported_name, source)
                        if name and name in self.sensors), self.sensors.get(''))
         if sensor is None:
@@ -302,7 +296,6 @@ class Driver:
         return self._measured_ns
 
     def _drop_clocks(self) -> None:
-        """Drop the clocks of sources that are no longer selected; keep their counts."""
         selected = {claim.selected[1] for claim in self._claims.values() if claim.selected}
         for source in self._clocks.keys() - selected:
             clock = self._clocks.pop(source)

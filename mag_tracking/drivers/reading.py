@@ -11,12 +11,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 Axes: TypeAlias = tuple[float, float, float]
-"""Components x, y and z of a vector."""
 
 
 class DeviceDate(float):
-    """Date and time of a device's clock, in microseconds since 1970 UTC, whatever the clock
-    settings."""
+    """Date and time of a device, in microseconds since 1970 UTC, whatever the clock settings."""
 
 
 class Reading(NamedTuple):
@@ -178,12 +176,11 @@ class FramedDevice:
     def read(self, timeout_s: float) -> list[Arrival]:
         """Return the readings received; wait only if no data is available."""
         out: list[Arrival] = []
+        final = self._transport.is_message_oriented
         for chunk in self._transport.read(timeout_s):
-            data = (chunk.data if self._transport.is_message_oriented
-                    else self._unconsumed + chunk.data)
-            parsed = self._framing.parse(data, final=self._transport.is_message_oriented)
-            if not self._transport.is_message_oriented:
-                self._unconsumed = data[parsed.consumed:]
+            data = chunk.data if final else self._unconsumed + chunk.data
+            parsed = self._framing.parse(data, final=final)
+            self._unconsumed = b'' if final else data[parsed.consumed:]
             self._rejected.update(parsed.rejected)
             if parsed.examples:
                 self.examples = {**parsed.examples, **self.examples}

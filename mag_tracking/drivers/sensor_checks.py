@@ -71,7 +71,6 @@ class SequenceCheck:
         return distance
 
     def _record_gap(self, sequence: int, n: int) -> None:
-        """Count the `n` skipped numbers before `sequence` as lost."""
         if n:
             self.counts['lost'] += n
         for number in range(sequence - min(n, MAX_REMEMBERED), sequence):
@@ -80,7 +79,6 @@ class SequenceCheck:
 
 
 def _trim(memory: dict[int, bytes] | dict[int, bool]) -> None:
-    """Remove the oldest entries beyond `MAX_REMEMBERED`."""
     while len(memory) > MAX_REMEMBERED:
         del memory[next(iter(memory))]
 
@@ -183,7 +181,6 @@ class SingleSource:
         return source == self.selected
 
     def _is_better(self, sender: _Sender, now_ns: int) -> bool:
-        """Whether a source is preferable to the selected one."""
         if self.selected is None or self.selected not in self._senders:
             return True
         selected = self._senders[self.selected]
@@ -218,7 +215,6 @@ def contest(sensor: str, selected: Source | None, rates_hz: Mapping[Source, floa
 
 
 def _label(source: Source) -> str:
-    """Name and origin of the readings of a source."""
     return ' from '.join(part for part in source if part) or 'a source without a name'
 
 

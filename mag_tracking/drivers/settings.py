@@ -10,7 +10,6 @@ from mag_tracking.settings import param
 ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
 """Factor from each unit to m/s²."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
-"""Permitted values of `stamp_by`."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,7 @@ class DriverSettings:
 
 
 def acceleration_scale(unit: str) -> float:
-    """Convert a key of `ACCELERATION_UNITS` or a number (m/s² per count) to m/s²; raises
-    SettingsError."""
+    """Convert a key of `ACCELERATION_UNITS` or a number to m/s² per count; raises SettingsError."""
     if unit in ACCELERATION_UNITS:
         return ACCELERATION_UNITS[unit]
     try:

@@ -106,11 +106,6 @@ class SimulatedDevice:
     def close(self) -> None:
         """Do nothing; the simulated time continues."""
 
-    @property
-    def _period_s(self) -> float:
-        """Interval between vehicles [s]."""
-        return max(self._settings.period_s, self._passing_s)
-
     def _elapsed(self) -> float:
         """Time since the first `open` [s]."""
         return (self._monotonic_ns() - self._start_ns) / 1e9
@@ -131,7 +126,8 @@ class SimulatedDevice:
         index, j = np.divmod(np.arange(first, end), len(self._network))
         due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
         # The table covers one pass; its last row, without a vehicle, is used until the next pass.
-        row = index % round(self._period_s * self._settings.rate_hz)
+        period_s = max(self._settings.period_s, self._passing_s)
+        row = index % round(period_s * self._settings.rate_hz)
         B = table[np.minimum(row, len(table) - 1), j]
         B = B + self._settings.noise * self._rng.standard_normal(B.shape)
         now, names = self._monotonic_ns(), self._network.names
@@ -140,8 +136,7 @@ class SimulatedDevice:
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _field_of_pass(self) -> FloatArray:
-        """Field at each time of a pass, (n, n_sensors, 3) T, sensor frames; the last row has no
-        vehicle."""
+        """Field during a pass, (n, n_sensors, 3) T, sensor frames; the last row has no vehicle."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)

@@ -28,8 +28,7 @@ ROS1 = 'ros1'
 _ENCAPSULATIONS = {2: 'CDR with parameter lists', 3: 'CDR with parameter lists', 6: 'XCDR2',
                    7: 'XCDR2', 8: 'XCDR2 with delimiters', 9: 'XCDR2 with delimiters',
                    10: 'XCDR2 with parameter lists', 11: 'XCDR2 with parameter lists'}
-"""Encodings that DDS may use in place of plain CDR, by the second byte of a message (DDS-XTypes
-1.3, table 60)."""
+"""Other encodings of DDS than CDR, by the second byte of a message (DDS-XTypes 1.3, table 60)."""
 _FIELD_DOUBLES = 12
 """Number of float64 values in a MagneticField: x, y, z and the covariance."""
 _STAMPS = ('stamp', 'timestamp')
@@ -38,12 +37,10 @@ _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
 SELF_DESCRIBED = ('json', 'protobuf')
 """Encodings whose messages are converted by means of their schema or of their own names."""
 UNDECODABLE = 'undecodable message'
-"""Fault of a message whose bytes do not match its type."""
 
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
-    """Convert a serialised ROS 1 message to CDR; empty if damaged or of an unsupported type (name
-    in ROS 2)."""
+    """Convert a ROS 1 message to CDR; empty if damaged or of an unsupported type (ROS 2 name)."""
     if type_name not in DEFINITIONS:
         return b''
     try:
@@ -128,7 +125,6 @@ def _part(message: Any, name: str) -> Any:
 
 
 def _field(message: Any) -> MessageDict:
-    """Convert a message to sensor_msgs/MagneticField; raises ValueError for an invalid message."""
     field = _part(message, 'magnetic_field')
     if field is None:
         raise MissingPartError('magnetic_field')
@@ -153,7 +149,6 @@ def _number(value: Any) -> Any:
 
 
 def _time(stamp: Any) -> dict[str, int]:
-    """Convert a time to builtin_interfaces/Time; raises ValueError if it is not valid."""
     stamp = _number(stamp)
     if isinstance(stamp, str):
         raise MissingPartError('sec in its time, which is text')

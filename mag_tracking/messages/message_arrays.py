@@ -26,8 +26,7 @@ class FieldArrays(NamedTuple):
 
     is_decoded: BoolArray
     """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
-    CDR, or in a frame with a non-ASCII name. The corresponding elements of the other arrays are
-    invalid."""
+    CDR, or in a frame with a non-ASCII name. Its elements of the other arrays are invalid."""
     stamp_ns: IntArray
     field: FloatArray
     """(n, 3) [T] Field, sensor frame."""
@@ -38,11 +37,10 @@ class FieldArrays(NamedTuple):
 
 
 class PoseArrays(NamedTuple):
-    """Contents of geometry_msgs/PoseStamped messages as arrays."""
+    """Contents of geometry_msgs/PoseStamped messages, as `FieldArrays`; messages in another frame
+    are not decoded either."""
 
     is_decoded: BoolArray
-    """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
-    CDR, or in another frame. The corresponding elements of the other arrays are invalid."""
     stamp_ns: IntArray
     pose: FloatArray
     """(n, 7) Position [m] and quaternion xyzw."""

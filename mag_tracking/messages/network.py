@@ -12,16 +12,7 @@ from mag_tracking.calibration.doubtful_times import DoubtfulTimes
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.inference.covariances import MIN_PIVOT, smallest_pivots
-from mag_tracking.messages.schema import (
-    CalibrationState,
-    NetworkFrame,
-    float64_array,
-    header_dict,
-    quaternion_dict,
-    stamp_dict,
-    stamp_ns,
-    xyz,
-)
+from mag_tracking.messages import schema
 from mag_tracking.messages.types import MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
@@ -40,14 +31,15 @@ class NamedSensors(Protocol):
 
 def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
     """Convert a `FieldFrame` to mag_tracking_msgs/NetworkFrame."""
-    return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
-            'field': float64_array(frame.field), 'covariance': float64_array(frame.covariance),
-            'n_samples': frame.n_samples.tolist(), 'time_offset': float64_array(frame.time_offset),
+    arrays = {name: schema.float64_array(getattr(frame, name))
+              for name in ('field', 'covariance', 'time_offset')}
+    return {**arrays, 'header': schema.header_dict(frame.stamp_ns, network.frame),
+            'sensors': list(network.names), 'n_samples': frame.n_samples.tolist(),
             'target_present': frame.target_present,
             'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
 
 
-def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
+def frame_of(message: schema.NetworkFrame, network: NamedSensors) -> FieldFrame:
     """Convert a NetworkFrame, with the network's sensors in the same order, to a `FieldFrame`;
     raises RecordingError if it does not match the network or a value is invalid."""
     n = len(network.names)
@@ -61,7 +53,7 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
         raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {required}; '
                              f'got {lengths}')
     frame = FieldFrame(
-        stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
+        schema.stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
         np.array(message.covariance).reshape(n, 3, 3), np.array(message.n_samples, dtype=int),
         np.array(message.time_offset, dtype=float), bool(message.target_present),
         float(message.statistic), int(message.degrees_of_freedom))
@@ -77,8 +69,6 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
 
 
 class _Calibration(Protocol):
-    """Interface of the calibration stage, `Calibrate`."""
-
     def background(self, sensor: str) -> FloatArray: ...
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None: ...
     def backgrounds(self) -> Mapping[str, RunningBackground]: ...
@@ -87,8 +77,7 @@ class _Calibration(Protocol):
 
 
 def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> MessageDict:
-    """Convert the calibration of sensor `j` to mag_tracking_msgs/SensorCalibration; unknown values
-    are NaN."""
+    """Calibration of sensor `j` as mag_tracking_msgs/SensorCalibration; NaN if unknown."""
     name = network.names[j]
     background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
@@ -97,13 +86,13 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
     record = network.calibrated[j]
     begin, end = calibrate.latest_doubt(name) or (0, 0)
     return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
-            'doubtful': end is None,
-            'doubtful_since': stamp_dict(begin), 'doubtful_until': stamp_dict(end or 0),
-            'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
+            'doubtful': end is None, 'doubtful_since': schema.stamp_dict(begin),
+            'doubtful_until': schema.stamp_dict(end or 0),
+            'background': schema.xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
             'covariance': (np.full((3, 3), np.nan) if C is None else C).ravel().tolist(),
             'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
             'n_relearnt': background.n_relearnt,
-            'orientation': quaternion_dict(q),
+            'orientation': schema.quaternion_dict(q),
             'orientation_std': (np.full(3, np.nan) if std is None else std).tolist(),
             'clock_offset': float(network.clock_offset[j]),
             'clock_offset_std': float('nan') if record is None else record.clock_offset_std,
@@ -111,16 +100,16 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
             'calibrated_by': '' if record is None else record.by}
 
 
-def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
+def doubtful_times(message: schema.CalibrationState) -> dict[str, DoubtfulTimes]:
     """Latest doubtful interval of each sensor's background; empty if it was never doubtful."""
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
-        begin, end = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
+        begin, end = schema.stamp_ns(s.doubtful_since), schema.stamp_ns(s.doubtful_until)
         times[s.sensor] = ((begin, end or None),) if begin else ()
     return times
 
 
-def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
+def with_orientations(network: SensorNetwork, message: schema.CalibrationState) -> SensorNetwork:
     """Copy a network, with the sensor orientations of a CalibrationState; raises RecordingError if
     sensors or frame differ from the network's, or an orientation or its std is invalid."""
     names = tuple(s.sensor for s in message.sensors)

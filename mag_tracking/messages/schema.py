@@ -7,26 +7,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mag_tracking import records
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.event_records import (
-    Disturbance,
-    PassEvent,
-    TrafficSummary,
-    VehiclePassage,
-)
+from mag_tracking.event_records import Disturbance, PassEvent, TrafficSummary, VehiclePassage
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.types import MessageDict
-from mag_tracking.records import (
-    AccelerationSample,
-    Detection,
-    Hypothesis,
-    PoseUncertainty,
-    Readings,
-    SmoothedPose,
-    Track,
-    best_of_arrivals,
-)
 from mag_tracking.units import LATEST_NS
 
 
@@ -127,12 +113,12 @@ def stamp_dict(ns: int) -> MessageDict:
     return {'sec': ns // 1_000_000_000, 'nanosec': ns % 1_000_000_000}
 
 
-def reading_of(message: MagneticField, sensor: str) -> Readings:
+def reading_of(message: MagneticField, sensor: str) -> records.Readings:
     """Convert a MagneticField message to `Readings` with a single reading."""
     f = message.magnetic_field
     C = known_covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
-    return Readings.single(sensor, stamp_ns(message.header.stamp), np.array([f.x, f.y, f.z]),
-                           None if C is None else C[0])
+    return records.Readings.single(sensor, stamp_ns(message.header.stamp),
+                                   np.array([f.x, f.y, f.z]), None if C is None else C[0])
 
 
 def known_covariances(C: FloatArray) -> FloatArray | None:
@@ -148,13 +134,13 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
     return np.where(is_known[:, None, None], C, np.nan)
 
 
-def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
+def acceleration_of(message: Imu, sensor: str) -> records.AccelerationSample:
     """Convert an Imu message to an `AccelerationSample`; NaN if the first element of the
     covariance, -1, marks that it contains no acceleration."""
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
-    return AccelerationSample(stamp_ns(message.header.stamp), sensor,
-                              np.array([a.x, a.y, a.z]) if is_present else np.full(3, np.nan))
+    acceleration = np.array([a.x, a.y, a.z]) if is_present else np.full(3, np.nan)
+    return records.AccelerationSample(stamp_ns(message.header.stamp), sensor, acceleration)
 
 
 def float64_array(values: ArrayLike) -> 'array[float]':
@@ -178,7 +164,8 @@ def header_dict(ns: int, frame: str) -> MessageDict:
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
 
 
-def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
+def magnetic_field_dicts(readings: records.Readings, frame: str = ''
+                         ) -> list[tuple[str, MessageDict]]:
     """Convert `Readings` to one sensor_msgs/MagneticField per reading, with the name of its sensor,
     also the default frame; an unknown covariance is all zero."""
     C: FloatArray = np.zeros((len(readings), 9))
@@ -192,7 +179,7 @@ def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str,
                 strict=True)]
 
 
-def readings_dict(readings: Readings) -> MessageDict:
+def readings_dict(readings: records.Readings) -> MessageDict:
     """Convert `Readings` to mag_tracking_msgs/FieldReadings; raises RecordingError if only some
     covariances are known, or `readings` is empty."""
     C = readings.covariance
@@ -207,7 +194,7 @@ def readings_dict(readings: Readings) -> MessageDict:
             'covariance': float64_array(np.zeros(0) if C is None else C)}
 
 
-def readings_of(message: FieldReadings) -> Readings:
+def readings_of(message: FieldReadings) -> records.Readings:
     """Convert a FieldReadings message to `Readings`; raises RecordingError if array lengths, sensor
     names, indices or timestamps are invalid."""
     n, names = len(message.sensor), tuple(message.sensors)
@@ -229,14 +216,14 @@ def readings_of(message: FieldReadings) -> Readings:
     C: FloatArray | None = None
     if len(message.covariance):
         C = known_covariances(np.array(message.covariance, dtype=float).reshape(n, 3, 3))
-    return Readings(names, sensor, stamps, np.array(message.field, dtype=float).reshape(n, 3), C)
+    field = np.array(message.field, dtype=float).reshape(n, 3)
+    return records.Readings(names, sensor, stamps, field, C)
 
 
-def acceleration_dict(sample: AccelerationSample, frame: str) -> MessageDict:
+def acceleration_dict(sample: records.AccelerationSample, frame: str) -> MessageDict:
     """Convert an `AccelerationSample` to sensor_msgs/Imu.
 
-    Orientation and angular velocity are marked as not provided; the covariance of the acceleration
-    is zero, which means unknown.
+    Orientation and angular velocity are not provided; a zero covariance means unknown.
     """
     not_provided = [-1.0] + 8 * [0.0]
     return {'header': header_dict(sample.stamp_ns, frame),
@@ -253,7 +240,7 @@ def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
     return {'position': xyz(position), 'orientation': quaternion_dict(quaternion)}
 
 
-def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
+def pose_covariance(uncertainty: records.Pose | records.PoseUncertainty) -> FloatArray:
     """Covariance (6, 6) of a pose as in ROS: position [m²], small rotations [rad²], world frame."""
     C = np.empty((6, 6))
     C[:3, :3] = uncertainty.covariance[:3, :3]
@@ -263,14 +250,14 @@ def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> Floa
     return C
 
 
-def pose_with_covariance_dict(track: Track | SmoothedPose,
-                              uncertainty: PoseUncertainty | None = None) -> MessageDict:
+def pose_with_covariance_dict(track: records.Pose,
+                              uncertainty: records.PoseUncertainty | None = None) -> MessageDict:
     """Convert a pose to geometry_msgs/PoseWithCovariance; `uncertainty` replaces its covariance."""
     return {'pose': _pose(track.position, track.orientation),
             'covariance': pose_covariance(uncertainty or track).ravel().tolist()}
 
 
-def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
+def pose_message_dict(track: records.Track, frame: str) -> MessageDict | None:
     """Convert a `Track` to PoseWithCovarianceStamped; None if the pose is withheld as ambiguous."""
     if track.topic_uncertainty is None:
         return None
@@ -278,7 +265,7 @@ def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
             'pose': pose_with_covariance_dict(track, track.topic_uncertainty)}
 
 
-def track_dict(track: Track, frame: str) -> MessageDict:
+def track_dict(track: records.Track, frame: str) -> MessageDict:
     """Convert a `Track` to mag_tracking_msgs/Track."""
     return {'header': header_dict(track.stamp_ns, frame), 'id': track.id,
             'status': int(track.ended), 'pose': pose_with_covariance_dict(track),
@@ -295,27 +282,27 @@ def track_dict(track: Track, frame: str) -> MessageDict:
             'mounting': float64_array(track.mounting),
             'mounting_covariance': float64_array(track.mounting_covariance),
             'doubts': list(track.doubts),
-            'arrivals': [_hypothesis_dict(h) for h in best_of_arrivals(track.hypotheses)]}
+            'arrivals': [_hypothesis_dict(h) for h in records.best_of_arrivals(track.hypotheses)]}
 
 
-def hypotheses_dict(track: Track, frame: str) -> MessageDict:
+def hypotheses_dict(track: records.Track, frame: str) -> MessageDict:
     """Convert the hypotheses of a `Track` to mag_tracking_msgs/HypothesisArray."""
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
             'hypotheses': [_hypothesis_dict(h) for h in track.hypotheses]}
 
 
-def _hypothesis_dict(h: Hypothesis) -> MessageDict:
+def _hypothesis_dict(h: records.Hypothesis) -> MessageDict:
     return {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
             'position': xyz(h.position), 'velocity': xyz(h.velocity),
             'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}
 
 
-def smoothed_pose_dict(pose: SmoothedPose, frame: str) -> MessageDict:
+def smoothed_pose_dict(pose: records.SmoothedPose, frame: str) -> MessageDict:
     """Convert a `SmoothedPose` to geometry_msgs/PoseWithCovarianceStamped."""
     return {'header': header_dict(pose.stamp_ns, frame), 'pose': pose_with_covariance_dict(pose)}
 
 
-def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDict:
+def smoothed_track_dict(poses: Sequence[records.SmoothedPose], frame: str) -> MessageDict:
     """Convert at least one pose of a track, chronological, to mag_tracking_msgs/SmoothedTrack."""
     last = poses[-1]
     return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
@@ -326,7 +313,7 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
             'velocities': [xyz(p.velocity) for p in poses]}
 
 
-def detection_dict(d: Detection, frame: str) -> MessageDict:
+def detection_dict(d: records.Detection, frame: str) -> MessageDict:
     """Convert a `Detection` to mag_tracking_msgs/Detection."""
     return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'kind': int(not d.onset),
             'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
@@ -375,7 +362,7 @@ def traffic_summary_dict(s: TrafficSummary, frame: str) -> MessageDict:
                  'mean_headway': c.mean_headway} for c in s.counts]}
 
 
-def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
+def odometry_dict(track: records.Track, frame: str, child_frame: str) -> MessageDict | None:
     """Convert a `Track` to nav_msgs/Odometry; None if the pose is withheld as ambiguous.
 
     The twist is in the child frame, as REP-105 requires. The angular velocity is not estimated: it

@@ -10,12 +10,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import quaternion_from_rotation
-from mag_tracking.messages.schema import (
-    header_dict,
-    pose_with_covariance_dict,
-    quaternion_dict,
-    xyz,
-)
+from mag_tracking.messages import schema
 from mag_tracking.messages.types import MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import PoseUncertainty, Track
@@ -28,8 +23,7 @@ _ADD, _DELETE = 0, 2
 _REGION_RADIUS = 2.5003
 """Radius of the 90 % region in standard deviations (chi-square, 3 degrees of freedom)."""
 SENSOR_SIZE_M = 0.3
-"""[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
-distance."""
+"""[m] Maximum length of a sensor marker, which is at most half the smallest sensor distance."""
 _UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
 _BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
 """Colours that remain distinguishable with colour blindness (Okabe and Ito)."""
@@ -42,15 +36,15 @@ def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageD
     if track.ambiguous:
         return None
     return {'transforms': [{
-        'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
-        'transform': {'translation': xyz(track.position),
-                      'rotation': quaternion_dict(track.orientation)}}]}
+        'header': schema.header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
+        'transform': {'translation': schema.xyz(track.position),
+                      'rotation': schema.quaternion_dict(track.orientation)}}]}
 
 
 def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[MessageDict]:
     """geometry_msgs/TransformStamped from the world frame to each sensor, named after it."""
-    return [{'header': header_dict(stamp_ns, network.frame), 'child_frame_id': name,
-             'transform': {'translation': xyz(position), 'rotation': quaternion_dict(
+    return [{'header': schema.header_dict(stamp_ns, network.frame), 'child_frame_id': name,
+             'transform': {'translation': schema.xyz(position), 'rotation': schema.quaternion_dict(
                  quaternion_from_rotation(R))}}
             for name, position, R in zip(network.names, network.positions, network.R_ws,
                                          strict=True)]
@@ -62,10 +56,10 @@ def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     Each result is a kind of target with its probability and the pose of the track. Width and height
     of the bounding box are not observable and are 0.
     """
-    header = header_dict(track.stamp_ns, frame)
+    header = schema.header_dict(track.stamp_ns, frame)
     if track.ended or track.topic_uncertainty is None:
         return {'header': header, 'detections': []}
-    pose = pose_with_covariance_dict(track, track.topic_uncertainty)
+    pose = schema.pose_with_covariance_dict(track, track.topic_uncertainty)
     weights: dict[str, float] = {}
     for h in track.hypotheses:
         weights[h.kind] = weights.get(h.kind, 0.0) + h.weight
@@ -90,39 +84,34 @@ def delete_markers(track: Track, frame: str) -> dict[str, Any]:
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
     """MarkerArray that shows the sensors and their names."""
-    size = min(SENSOR_SIZE_M, 0.5 * _smallest_distance(network.positions))
+    distances = np.linalg.norm(network.positions[:, None] - network.positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    size = min(SENSOR_SIZE_M, 0.5 * float(distances.min()))
     markers = []
     for j, name in enumerate(network.names):
-        common = {'header': header_dict(0, network.frame), 'id': j, 'action': _ADD}
+        common = {'header': schema.header_dict(0, network.frame), 'id': j, 'action': _ADD}
         markers.append({
             **common, 'ns': SENSOR_NAMESPACES[0], 'type': _CUBE, 'color': _GREY,
-            'pose': {'position': xyz(network.positions[j]), 'orientation': quaternion_dict(
-                quaternion_from_rotation(network.R_ws[j]))},
-            'scale': xyz(np.array([1.0, 0.6, 0.2]) * size)})
+            'pose': {'position': schema.xyz(network.positions[j]),
+                     'orientation': schema.quaternion_dict(
+                         quaternion_from_rotation(network.R_ws[j]))},
+            'scale': schema.xyz(np.array([1.0, 0.6, 0.2]) * size)})
         above = network.positions[j] + [0.0, 0.0, size]
         markers.append({
             **common, 'ns': SENSOR_NAMESPACES[1], 'type': _TEXT, 'color': _GREY, 'text': name,
-            'pose': {'position': xyz(above), 'orientation': _UPRIGHT},
+            'pose': {'position': schema.xyz(above), 'orientation': _UPRIGHT},
             'scale': {'x': 0.0, 'y': 0.0, 'z': size}})
     return {'markers': markers}
 
 
-def _smallest_distance(positions: FloatArray) -> float:
-    """Smallest distance [m] between two sensors; infinite for a single sensor."""
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    return float(distances.min())
-
-
 def _marker(track: Track, frame: str, namespace: str, shape: int,
             **message_fields: Any) -> dict[str, Any]:
-    return {'header': header_dict(track.stamp_ns, frame), 'ns': namespace, 'id': track.id,
+    return {'header': schema.header_dict(track.stamp_ns, frame), 'ns': namespace, 'id': track.id,
             'type': shape, **message_fields}
 
 
 def ellipsoid_axes(C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (3,) along the axes of a covariance (3, 3), and the quaternion xyzw that
-    rotates to them."""
+    """Standard deviations (3,) along the axes of a covariance (3, 3), and their quaternion xyzw."""
     variances, R = np.linalg.eigh(C)
     if np.linalg.det(R) < 0.0:
         R = -R
@@ -135,9 +124,9 @@ def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
     std, q = ellipsoid_axes(uncertainty.covariance[:3, :3])
     return _marker(
         track, frame, 'ellipsoid', _SPHERE, action=_ADD, lifetime={'sec': LIFETIME_S},
-        pose={'position': xyz(track.position), 'orientation': quaternion_dict(q)},
+        pose={'position': schema.xyz(track.position), 'orientation': schema.quaternion_dict(q)},
         # RViz rejects spheres with zero thickness.
-        scale=xyz(np.maximum(2.0 * _REGION_RADIUS * std, 1e-6)),
+        scale=schema.xyz(np.maximum(2.0 * _REGION_RADIUS * std, 1e-6)),
         color={**_BLUE, 'a': 0.15 if track.ambiguous else 0.35})
 
 
@@ -147,7 +136,7 @@ def _arrow(track: Track, frame: str) -> dict[str, Any]:
     tip = track.position + length * track.moment / np.linalg.norm(track.moment)
     return _marker(
         track, frame, 'moment', _ARROW, action=_ADD, lifetime={'sec': LIFETIME_S},
-        points=[xyz(track.position), xyz(tip)], pose={'orientation': _UPRIGHT},
+        points=[schema.xyz(track.position), schema.xyz(tip)], pose={'orientation': _UPRIGHT},
         scale={'x': 0.08 * length, 'y': 0.16 * length, 'z': 0.2 * length},
         color={**_RED, 'a': 1.0})
 
@@ -160,5 +149,6 @@ def _label(track: Track, frame: str) -> dict[str, Any]:
     return _marker(
         track, frame, 'label', _TEXT, action=_ADD, lifetime={'sec': LIFETIME_S},
         text=' '.join(words) + ('?' if track.ambiguous else ''),
-        pose={'position': xyz(track.position + [0.0, 0.0, 2.0 * size]), 'orientation': _UPRIGHT},
+        pose={'position': schema.xyz(track.position + [0.0, 0.0, 2.0 * size]),
+              'orientation': _UPRIGHT},
         scale={'x': 0.0, 'y': 0.0, 'z': size}, color={**_GREY})

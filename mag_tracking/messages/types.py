@@ -23,48 +23,34 @@ MessageDict: TypeAlias = dict[str, Any]
 """Message to be written, as nested dicts of its fields."""
 
 DEFINITIONS: dict[str, str] = {
-    'builtin_interfaces/msg/Duration': (
-        'int32 sec\nuint32 nanosec\n'),
-    'builtin_interfaces/msg/Time': (
-        'int32 sec\nuint32 nanosec\n'),
-    'std_msgs/msg/ColorRGBA': (
-        'float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n'),
-    'std_msgs/msg/Header': (
-        'builtin_interfaces/Time stamp\nstring frame_id\n'),
-    'geometry_msgs/msg/Point': (
-        'float64 x\nfloat64 y\nfloat64 z\n'),
+    'builtin_interfaces/msg/Duration': 'int32 sec\nuint32 nanosec\n',
+    'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec\n',
+    'std_msgs/msg/ColorRGBA': 'float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n',
+    'std_msgs/msg/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',
+    'geometry_msgs/msg/Point': 'float64 x\nfloat64 y\nfloat64 z\n',
     'geometry_msgs/msg/Pose': (
         'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n'),
-    'geometry_msgs/msg/PoseStamped': (
-        'std_msgs/Header header\ngeometry_msgs/Pose pose\n'),
-    'geometry_msgs/msg/PoseWithCovariance': (
-        'geometry_msgs/Pose pose\nfloat64[36] covariance\n'),
+    'geometry_msgs/msg/PoseStamped': 'std_msgs/Header header\ngeometry_msgs/Pose pose\n',
+    'geometry_msgs/msg/PoseWithCovariance': 'geometry_msgs/Pose pose\nfloat64[36] covariance\n',
     'geometry_msgs/msg/PoseWithCovarianceStamped': (
         'std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n'),
-    'geometry_msgs/msg/Quaternion': (
-        'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n'),
+    'geometry_msgs/msg/Quaternion': 'float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n',
     'geometry_msgs/msg/Transform': (
         'geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n'),
     'geometry_msgs/msg/TransformStamped': (
         'std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n'),
-    'geometry_msgs/msg/Twist': (
-        'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n'),
-    'geometry_msgs/msg/TwistWithCovariance': (
-        'geometry_msgs/Twist twist\nfloat64[36] covariance\n'),
-    'geometry_msgs/msg/Vector3': (
-        'float64 x\nfloat64 y\nfloat64 z\n'),
-    'sensor_msgs/msg/CompressedImage': (
-        'std_msgs/Header header\nstring format\nuint8[] data\n'),
+    'geometry_msgs/msg/Twist': 'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n',
+    'geometry_msgs/msg/TwistWithCovariance': 'geometry_msgs/Twist twist\nfloat64[36] covariance\n',
+    'geometry_msgs/msg/Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
+    'sensor_msgs/msg/CompressedImage': 'std_msgs/Header header\nstring format\nuint8[] data\n',
     'sensor_msgs/msg/MagneticField': (
         'std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\n'
         'float64[9] magnetic_field_covariance\n'),
     'nav_msgs/msg/Odometry': (
         'std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n'
         'geometry_msgs/TwistWithCovariance twist\n'),
-    'nav_msgs/msg/Path': (
-        'std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses\n'),
-    'tf2_msgs/msg/TFMessage': (
-        'geometry_msgs/TransformStamped[] transforms\n'),
+    'nav_msgs/msg/Path': 'std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses\n',
+    'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] transforms\n',
     'visualization_msgs/msg/Marker': (
         'int32 ARROW=0\nint32 CUBE=1\nint32 SPHERE=2\nint32 CYLINDER=3\nint32 LINE_STRIP=4\n'
         'int32 LINE_LIST=5\nint32 CUBE_LIST=6\nint32 SPHERE_LIST=7\nint32 POINTS=8\n'
@@ -77,12 +63,9 @@ DEFINITIONS: dict[str, str] = {
         'sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\n'
         'string text\nstring mesh_resource\nvisualization_msgs/MeshFile mesh_file\n'
         'bool mesh_use_embedded_materials\n'),
-    'visualization_msgs/msg/MarkerArray': (
-        'visualization_msgs/Marker[] markers\n'),
-    'visualization_msgs/msg/MeshFile': (
-        'string filename\nuint8[] data\n'),
-    'visualization_msgs/msg/UVCoordinate': (
-        'float32 u\nfloat32 v\n'),
+    'visualization_msgs/msg/MarkerArray': 'visualization_msgs/Marker[] markers\n',
+    'visualization_msgs/msg/MeshFile': 'string filename\nuint8[] data\n',
+    'visualization_msgs/msg/UVCoordinate': 'float32 u\nfloat32 v\n',
     'mag_tracking_msgs/msg/Disturbance': (
         'std_msgs/Header header\nuint32 id\nbool ended\nbuiltin_interfaces/Time begin\n'
         'float64 largest\nstring[] sensors\nfloat64 uniform\nuint32 track_id\n'),
@@ -153,7 +136,6 @@ class RawMessage(NamedTuple):
 
 
 def _full_name(kind: str, package: str) -> str:
-    """Full name of the type that is called `kind` in a definition of `package`."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
@@ -166,17 +148,7 @@ def referenced_types(message_definition: str, package: str) -> list[str]:
         if field and not field['is_constant'] and field['type'] not in _BUILT_IN))
 
 
-def _dependencies(type_name: str) -> list[str]:
-    """Types contained in `type_name` at any depth, without duplicates, in breadth-first order."""
-    found = [type_name]
-    for name in found:
-        found += [n for n in referenced_types(DEFINITIONS[name], name.partition('/')[0])
-                  if n not in found]
-    return found[1:]
-
-
 def _own_definition(type_name: str) -> str:
-    """Definition of a type; raises RecordingError if it is unknown."""
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
     return DEFINITIONS[type_name]
@@ -184,8 +156,11 @@ def _own_definition(type_name: str) -> str:
 
 def definition(type_name: str) -> str:
     """Definition of a type and of all types it contains, in the format of a `ros2msg` schema."""
-    message_definition = _own_definition(type_name)
-    for name in _dependencies(type_name):
+    message_definition, found = _own_definition(type_name), [type_name]
+    for name in found:
+        found += [n for n in referenced_types(DEFINITIONS[name], name.partition('/')[0])
+                  if n not in found]
+    for name in found[1:]:
         package, _, leaf = name.split('/')
         message_definition += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
     return message_definition

@@ -25,8 +25,7 @@ _HEAD = '{"version": '
 
 
 def default_path(network_path: str | PathLike[str], node: str) -> Path:
-    """File in the state folder in which a node (fully qualified name) stores a network's
-    backgrounds."""
+    """File in the state folder in which a node (full name) stores a network's backgrounds."""
     path = Path(network_path).resolve()
     digest = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
     return state_folder() / f'{path.stem}_{digest}.json'

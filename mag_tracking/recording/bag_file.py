@@ -15,12 +15,7 @@ import lz4.frame
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.encodings import cdr_of_ros1
 from mag_tracking.messages.types import RawMessage, schema_of
-from mag_tracking.recording.expansion import (
-    DECODE_ERRORS,
-    RefusedDataError,
-    expanded,
-    largest_chunk,
-)
+from mag_tracking.recording import expansion
 from mag_tracking.recording.message_block import MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
@@ -63,7 +58,6 @@ class BagFile(RecordingFile):
                 self.start_ns, self.end_ns = time_range.start_time, time_range.end_time - 1
 
     def _open_reader(self) -> AbstractContextManager[Any]:
-        """Open the bag with the reader of `rosbags`; raises RecordingError."""
         # Imported here because most recordings are MCAP and do not need the library.
         from rosbags.rosbag1 import Reader
         from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
@@ -79,31 +73,27 @@ class BagFile(RecordingFile):
                progress: Progress | None = None) -> Iterator[MessageBlock]:
         """Iterate over blocks of CDR messages from `start_ns` on, in order of log time."""
         size, total = self._path.stat().st_size, max(self.message_counts.total(), 1)
-        reported = n = 0
+        reported = n = n_bytes = 0
         messages: list[RawMessage] = []
-        n_bytes = 0
-        for topic, kind, log_time_ns, data in self._raw(start_ns):
-            if self._is_ros1:
-                data = cdr_of_ros1(data, kind)
-            messages.append(RawMessage(topic, kind, log_time_ns, data, schema_of(kind)))
-            n_bytes += len(data)
-            if len(messages) < BLOCK_SIZE and n_bytes < BLOCK_BYTES:
-                continue
-            yield MessageBlock.of_messages(messages)
-            n += len(messages)
-            messages, n_bytes = [], 0
-            if progress and (position := size * n // total) > reported:
-                progress(position - reported)
-                reported = position
+        read = self._ros1_messages if self._is_ros1 else self._sqlite_messages
+        with self._open_reader() as reader:
+            for topic, kind, log_time_ns, data in read(reader, start_ns):
+                if self._is_ros1:
+                    data = cdr_of_ros1(data, kind)
+                messages.append(RawMessage(topic, kind, log_time_ns, data, schema_of(kind)))
+                n_bytes += len(data)
+                if len(messages) < BLOCK_SIZE and n_bytes < BLOCK_BYTES:
+                    continue
+                yield MessageBlock.of_messages(messages)
+                n += len(messages)
+                messages, n_bytes = [], 0
+                if progress and (position := size * n // total) > reported:
+                    progress(position - reported)
+                    reported = position
         if messages:
             yield MessageBlock.of_messages(messages)
             if progress and size > reported:
                 progress(size - reported)
-
-    def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        with self._open_reader() as reader:
-            yield from (self._ros1_messages if self._is_ros1 else self._sqlite_messages)(
-                reader, start_ns)
 
     def _sqlite_messages(self, reader: 'Sqlite3Reader', start_ns: int | None
                          ) -> Iterator[tuple[str, str, int, bytes]]:
@@ -127,11 +117,12 @@ class BagFile(RecordingFile):
     def _ros1_messages(self, reader: 'Ros1Reader', start_ns: int | None
                        ) -> Iterator[tuple[str, str, int, bytes]]:
         """Iterate over the messages, except those in damaged chunks."""
-        limit = largest_chunk()
+        limit = expansion.largest_chunk()
         # The library trusts the sizes in the file.
         reader.chunks = {position: chunk._replace(
-            datasize=min(chunk.datasize, limit + 1), decompressor=partial(
-                expanded, _ROS1_COMPRESSIONS.get(chunk.decompressor, 'none'), limit=limit))
+            datasize=min(chunk.datasize, limit + 1),
+            decompressor=partial(expansion.expanded, _ROS1_COMPRESSIONS.get(
+                chunk.decompressor, 'none'), limit=limit))
             for position, chunk in reader.chunks.items()}
         order: list[tuple[int, IndexData]] = []
         while True:
@@ -150,7 +141,7 @@ class BagFile(RecordingFile):
                 if n >= len(order):
                     return
                 damaged = order[n][1].chunk_pos
-                reason = f', {error}' if isinstance(error, RefusedDataError) else ''
+                reason = f', {error}' if isinstance(error, expansion.RefusedDataError) else ''
                 self._count_loss(damaged, f'damaged chunks ({self._path.name}{reason})')
             order = [pair for pair in order[n:] if pair[1].chunk_pos != damaged]
             reader.indexes = {number: [] for number in reader.indexes}
@@ -170,4 +161,4 @@ def bag_errors() -> tuple[type[Exception], ...]:
 
     # Damaged bytes can also trigger assertions of the library.
     return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, AssertionError, IndexError,
-            TypeError, AttributeError, OverflowError, *DECODE_ERRORS)
+            TypeError, AttributeError, OverflowError, *expansion.DECODE_ERRORS)

@@ -104,8 +104,7 @@ _PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {
 
 
 def expanded_message(data: bytes) -> bytes:
-    """Decompress a CDR message if the recorder has compressed it; empty if it is damaged or too
-    large."""
+    """Decompress a CDR message that the recorder has compressed; empty if damaged or too large."""
     compression = _MAGIC.get(data[:4])
     if compression is None:
         return data

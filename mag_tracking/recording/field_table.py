@@ -16,17 +16,10 @@ from mag_tracking.files import checked_path
 from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.quantities import quantity
+from mag_tracking.recording import table_times
 from mag_tracking.recording.table_columns import IGNORED, Columns, find_columns, sensor_name
 from mag_tracking.recording.table_layout import Table, read_table
 from mag_tracking.recording.table_text import FilePath, find_decimal, parse_number
-from mag_tracking.recording.table_times import (
-    MAX_STEPS,
-    check_range,
-    check_resolution,
-    order_times,
-    read_times,
-    span_text,
-)
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 from mag_tracking.units import DAY_NS, NS, time_unit
@@ -42,8 +35,7 @@ _DECIMALS = {'ms': 3, 'us': 6, 'ns': 9}
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Properties of a table that the user states, as the options of `mag-tracking import`; empty
-    ones are found from the table."""
+    """Options of `mag-tracking import`; empty ones are found from the table."""
 
     columns: Sequence[str] = ()
     unit: str = ''
@@ -191,10 +183,10 @@ def _stamps(rows: _Rows, decimal: str, options: TableOptions
         return (_at_rate(rows.keys, [0] * len(rows.keys), options.rate), [0] * len(rows.keys),
                 list(range(len(rows.keys))), [f'times from the rate, {options.rate:g} Hz'])
     where = f'{path}: {columns.time_name}'
-    times = read_times(where, rows.texts, rows.keys, decimal, options.time_unit,
-                       columns.time_unit, options.date_order)
-    ordered = order_times(where, times, rows.texts, rows.keys, rows.lines, options.wrap,
-                          options.jumps)
+    times = table_times.read_times(where, rows.texts, rows.keys, decimal, options.time_unit,
+                                   columns.time_unit, options.date_order)
+    ordered = table_times.order_times(where, times, rows.texts, rows.keys, rows.lines, options.wrap,
+                                      options.jumps)
     for k, value in enumerate(times.values):
         if value is None:
             rows.table.bad.append((rows.lines[k], f'{columns.time_name}: {rows.texts[k][:30]!r} is '
@@ -210,9 +202,9 @@ def _stamps(rows: _Rows, decimal: str, options: TableOptions
         stamps = [stamp - low for stamp in stamps]
         times.notes.append(f'times from {low / NS:.6g} s, shifted to 0')
     for k, stamp in zip(ordered.rows, stamps, strict=True):
-        check_range(where, rows.lines[k], stamp)
+        table_times.check_range(where, rows.lines[k], stamp)
     if options.rate is None:
-        check_resolution(where, rows.texts, ordered.values, keys)
+        table_times.check_resolution(where, rows.texts, ordered.values, keys)
     else:
         stamps = _at_rate(keys, stamps, options.rate)
     return stamps, ordered.session, ordered.rows, times.notes + ordered.notes
@@ -246,8 +238,7 @@ def _sessions(rows: _Rows, stamps: Sequence[int], session: Sequence[int], order:
 
 def import_field_table(table: FilePath, options: TableOptions, out: FilePath
                        ) -> tuple[list[Path], FieldTable]:
-    """Import a table as recordings in `out`, or in its folders `session_1`, `session_2`, ... if the
-    clock restarts."""
+    """Import a table to the folder `out`, or, if the clock restarts, to `session_1`, ... in it."""
     content = read_field_table(table, options)
     recordings = []
     for k, readings in enumerate(content.sessions):
@@ -261,8 +252,7 @@ def import_field_table(table: FilePath, options: TableOptions, out: FilePath
 
 
 def describe(readings: Readings) -> list[str]:
-    """Number, rate, gaps and median field of each sensor's readings (chronological), one line each,
-    and warnings."""
+    """Lines with number, rate, gaps and median field of each sensor's readings, and warnings."""
     out, magnitudes = [], []
     spans: dict[str, tuple[int, int]] = {}
     begin = int(readings.stamp_ns.min())
@@ -272,10 +262,11 @@ def describe(readings: Readings) -> list[str]:
             continue
         steps = np.diff(own.stamp_ns)
         step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-        gaps = np.flatnonzero(steps > MAX_STEPS * step)
+        gaps = np.flatnonzero(steps > table_times.MAX_STEPS * step)
         longest = gaps[np.argmax(steps[gaps])] if len(gaps) else 0
         rate = f'{NS / step:.4g} Hz' if step else 'no rate'
-        gap_text = (f'{quantity(len(gaps), "gap")}, longest {span_text(steps[longest] / NS)} at '
+        gap_text = (f'{quantity(len(gaps), "gap")}, longest '
+                    f'{table_times.span_text(steps[longest] / NS)} at '
                     f'{(own.stamp_ns[longest] - begin) / NS:.6g} s' if len(gaps) else 'no gaps')
         line = f'/{name}/imu/mag  {quantity(len(own), "reading")}, {rate}, {gap_text}'
         if not np.isnan(own.field).all(axis=0).any():

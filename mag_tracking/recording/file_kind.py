@@ -6,14 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 HEAD_SIZE = 4096
-"""Number of bytes at the beginning of a file by which it is recognised."""
 _IMPORT = 'then use `mag-tracking import`'
 _TO_CSV = f'No command reads it: write the field and its time to a CSV file, {_IMPORT}'
 
 
 class _Kind(NamedTuple):
-    """Kind of a file."""
-
     description: str
     advice: str
     magic: bytes = b''
@@ -75,23 +72,20 @@ _UNKNOWN = _Kind('of an unknown format', 'Recordings are .mcap, .db3 and .bag fi
 
 
 def describe_file(path: Path) -> str:
-    """Sentences that name a file that is no recording, its kind, and the command or program to read
-    it."""
+    """Sentences that name a file that is no recording, its kind, and the program to read it."""
     kind = _kind_of(path)
     return f'{path} is not a recording but {kind.description}. {kind.advice}'.replace(
         'FILE', str(path))
 
 
 def binary_kind(path: Path) -> str:
-    """Kind of a binary file and the command or program to read it; empty for text and unknown
-    formats."""
+    """Kind of a binary file and the program to read it; empty for text and unknown formats."""
     kind = _kind_of(path)
     return '' if kind in (_UNKNOWN, *(k for _, k in _TEXT)) else \
         f'{kind.description}. {kind.advice}'.replace('FILE', str(path))
 
 
 def _kind_of(path: Path) -> _Kind:
-    """Recognise a file by its first bytes."""
     with open(path, 'rb') as stream:
         head = stream.read(HEAD_SIZE)
     for kind in _BINARY:
@@ -113,7 +107,6 @@ def _kind_of(path: Path) -> _Kind:
 
 
 def _kind_of_zip(path: Path) -> _Kind:
-    """Recognise a ZIP archive by the names in it."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

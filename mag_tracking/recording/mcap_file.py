@@ -7,7 +7,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -16,19 +16,13 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.records import Channel, Schema, Statistics
 from mcap.summary import Summary
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.recording import core
-from mag_tracking.recording.expansion import (
-    DECODE_ERRORS,
-    RefusedDataError,
-    check_size,
-    expanded,
-    largest_chunk,
-)
+from mag_tracking.messages.encodings import type_of
+from mag_tracking.recording import core, expansion
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
@@ -39,8 +33,7 @@ the position of each message also takes memory."""
 RECORD_HEADER = struct.Struct('<BQ')
 """Operation code and length of the content of a record."""
 _FOOTER = struct.Struct('<BQQQI8s')
-"""Record `Footer` (operation code, length, start of summary and of summary offsets, CRC) and
-`MAGIC`."""
+"""Record `Footer` (code, length, start of summary and of summary offsets, CRC) and `MAGIC`."""
 _CHUNK_HEADER = struct.Struct('<QQQII')
 """Times of the first and last message [ns], uncompressed size, CRC, length of the compression."""
 _MAX_NAME = 64
@@ -83,7 +76,6 @@ class ChunkHeader(NamedTuple):
 
     start_ns: int
     end_ns: int
-    """Log time of the last message [ns]."""
     crc: int
     """CRC of the content; 0 if unknown."""
     compression: str
@@ -92,8 +84,7 @@ class ChunkHeader(NamedTuple):
 
 
 def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
-    """Read the header of a chunk, up to the beginning of its content; raises ValueError or EOFError
-    if it is damaged."""
+    """Read the header of a chunk, up to its content; raises ValueError or EOFError if damaged."""
     stream.seek(chunk.begin)
     opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
     if opcode != Opcode.CHUNK or chunk.begin + RECORD_HEADER.size + length != chunk.end:
@@ -117,8 +108,8 @@ def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
     """
     is_cut = chunk.end > file_size(stream)
     header = chunk_header(stream, chunk)
-    check_size(min(header.size, file_size(stream) - stream.tell()), limit)
-    data = expanded(header.compression, stream.read(header.size), limit, is_cut)
+    expansion.check_size(min(header.size, file_size(stream) - stream.tell()), limit)
+    data = expansion.expanded(header.compression, stream.read(header.size), limit, is_cut)
     if header.crc and not is_cut and zlib.crc32(data) != header.crc:
         raise ValueError('the CRC of the chunk is wrong')
     return data
@@ -154,7 +145,7 @@ def read_summary(stream: BinaryIO) -> Summary | None:
             _check_crc(stream, start, crc)
         stream.seek(0)
         return make_reader(stream).get_summary()
-    except DECODE_ERRORS:
+    except expansion.DECODE_ERRORS:
         return None
 
 
@@ -188,7 +179,7 @@ class McapFile(RecordingFile):
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
         super().__init__(path, losses)
-        self._limit = largest_chunk()
+        self._limit = expansion.largest_chunk()
         self._channels, self._counts = _Channels(), Counter[int]()
         self._parts: list[_Part] = []
         with open(path, 'rb') as stream:
@@ -209,9 +200,13 @@ class McapFile(RecordingFile):
             self._channels.add(channel)
         statistics = summary.statistics
         indexed = sorted(summary.chunk_indexes, key=lambda entry: entry.chunk_start_offset)
-        # A summary may omit channels and schemas; they are then read from the chunks.
+        ends = [len(MAGIC), *(entry.chunk_start_offset + entry.chunk_length for entry in indexed)]
+        # A summary may omit channels and schemas; they are then read from the chunks. Those of a
+        # valid index lie in the file, one after the other.
         if len(self._channels.kinds) < (statistics.channel_count if statistics else 1) \
-                or not _is_valid(indexed, file_size(stream)):
+                or ends[-1] > file_size(stream) or any(
+                    entry.chunk_start_offset < end
+                    for entry, end in zip(indexed, ends, strict=False)):
             indexed = []
         position = len(MAGIC)
         for entry in indexed:
@@ -268,7 +263,7 @@ class McapFile(RecordingFile):
         """Read a part for the first time; add it if it contains messages."""
         try:
             _, rows = self._read(stream, record)
-        except DECODE_ERRORS as error:
+        except expansion.DECODE_ERRORS as error:
             if record.end <= file_size(stream):
                 self._count_loss(record.begin,
                                  f'damaged chunks ({self._path.name}{_reason(error)})')
@@ -283,7 +278,7 @@ class McapFile(RecordingFile):
         if record.opcode == Opcode.CHUNK:
             data = chunk_content(stream, record, self._limit)
         else:
-            check_size(record.end - record.begin, self._limit)
+            expansion.check_size(record.end - record.begin, self._limit)
             stream.seek(record.begin)
             data = stream.read(record.end - record.begin)
         rows, definitions, end = core.records_of(data, LATEST_NS,
@@ -296,8 +291,7 @@ class McapFile(RecordingFile):
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over the messages chunk by chunk, in order of log time, without chunks that end
-        before `start_ns`."""
+        """Iterate over the chunks by log time, without those that end before `start_ns`."""
         pending = MessageBlock.of_messages([])
         parts = [p for p in self._parts if start_ns is None or p.end_ns >= start_ns]
         starts = [p.start_ns for p in parts[1:]]
@@ -305,7 +299,7 @@ class McapFile(RecordingFile):
             for part, next_start_ns in zip(parts, [*starts, LATEST_NS + 1], strict=False):
                 try:
                     block = self._block(stream, part.record)
-                except DECODE_ERRORS as error:
+                except expansion.DECODE_ERRORS as error:
                     self._count_lost_part(part, error)
                     block = MessageBlock.of_messages([])
                 if progress:
@@ -333,7 +327,6 @@ class McapFile(RecordingFile):
         return MessageBlock.of_rows(data, self._channels.kinds, rows)
 
     def _count_lost_part(self, part: _Part, error: Exception) -> None:
-        """Count an unreadable chunk as a loss, described by its duration and start time."""
         duration_s = (part.end_ns - part.start_ns) / 1e9
         start_s = (part.start_ns - (self.start_ns or part.start_ns)) / 1e9
         self._count_loss(part.record.begin, f'damaged segments ({self._path.name}, '
@@ -341,16 +334,9 @@ class McapFile(RecordingFile):
                          f'{_reason(error)})')
 
 
-def _is_valid(index: Sequence[ChunkIndex], size: int) -> bool:
-    """Whether the chunks of an index lie in a file of `size` bytes, one after the other."""
-    ends = [len(MAGIC), *(entry.chunk_start_offset + entry.chunk_length for entry in index)]
-    return ends[-1] <= size and all(
-        entry.chunk_start_offset >= end for entry, end in zip(index, ends, strict=False))
-
-
 def _reason(error: Exception) -> str:
     """Format why an intact chunk is not read; empty for a damaged chunk."""
-    return f', {error}' if isinstance(error, RefusedDataError) else ''
+    return f', {error}' if isinstance(error, expansion.RefusedDataError) else ''
 
 
 class _Channels:
@@ -368,7 +354,8 @@ class _Channels:
             for channel in self._waiting.pop(record.id, ()):
                 self.add(channel)
         elif record.schema_id in self._schemas:
-            self.kinds[record.id] = ChannelKind.of(
-                record.topic, record.message_encoding, self._schemas[record.schema_id])
+            encoding, schema = record.message_encoding, self._schemas[record.schema_id]
+            self.kinds[record.id] = ChannelKind(
+                record.topic, type_of(encoding, schema), schema, encoding)
         else:
             self._waiting.setdefault(record.schema_id, []).append(record)

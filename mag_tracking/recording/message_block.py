@@ -10,7 +10,7 @@ import numpy as np
 from mcap.records import Schema
 
 from mag_tracking.arrays import IntArray
-from mag_tracking.messages.encodings import CDR, cdr_of, type_of
+from mag_tracking.messages.encodings import CDR, cdr_of
 from mag_tracking.messages.types import ROS_SCHEMA, RawMessage, schema_of
 from mag_tracking.recording.expansion import expanded_message
 
@@ -46,7 +46,6 @@ class ChannelKind(NamedTuple):
 
     topic: str
     type: str
-    """Message type, as from `type_of`."""
     schema: Schema
     encoding: str = CDR
 
@@ -55,22 +54,9 @@ class ChannelKind(NamedTuple):
         """Whether the messages are encoded as CDR."""
         return self.encoding == CDR
 
-    @classmethod
-    def of(cls, topic: str, encoding: str, schema: Schema) -> 'ChannelKind':
-        """Describe a channel by the schema in its file."""
-        return cls(topic, type_of(encoding, schema), schema, encoding)
-
 
 class RecordingFile:
-    """One file of a recording.
-
-    Attributes
-    ----------
-    types : message type by topic
-    message_counts : number of messages by topic; empty if unknown
-    start_ns, end_ns : log times of the first and last message; None without messages
-    losses : number of unreadable parts by description, updated in place
-    """
+    """One file of a recording, with attributes of `Recording`; `losses` is updated in place."""
 
     def __init__(self, path: Path, losses: Counter[str]) -> None:
         self._path, self._losses = path, losses
@@ -105,8 +91,7 @@ class MessageBlock:
     @classmethod
     def of_rows(cls, data: bytes, kinds: Mapping[int, ChannelKind],
                 rows: IntArray) -> 'MessageBlock':
-        """Create a block from rows (n, 4) in any order: channel, log time [ns], begin and end in
-        `data`."""
+        """Create a block of rows (n, 4) in any order: channel, log time [ns], begin and end."""
         block = cls(data, kinds, *np.ascontiguousarray(rows.T))
         if np.all(rows[1:, 1] >= rows[:-1, 1]):
             return block

@@ -40,15 +40,13 @@ def read_pose_table(path: FilePath) -> tuple[FloatArray, FloatArray, FloatArray]
 
 
 def read_readings(path: FilePath) -> FloatArray:
-    """Fields (K, n, 3), T, sensor frames, of a pose table, which may lack pose columns; NaN if not
-    measured."""
+    """Fields (K, n, 3), T, sensor frames, of a table that may lack poses; NaN if not measured."""
     rows, values = _values(path, ())
     return values.reshape(len(rows), -1, 3)
 
 
 def read_sensor_positions(path: FilePath) -> FloatArray:
-    """Sensor positions (n, 3), m, from a CSV file x, y, z without header; # begins a comment
-    line."""
+    """Sensor positions (n, 3), m, from a CSV file x, y, z without header; # begins a comment."""
     return read_csv(path, 'xyz').numbers('xyz')
 
 
@@ -68,8 +66,7 @@ def _values(path: FilePath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
 
 def import_pose_table(table: FilePath, background: FilePath, out: FilePath,
                       noise_std: float) -> tuple[Path, Path, int]:
-    """Import a table of magnet poses and sensor fields; return recording, network file and row
-    count.
+    """Import a table of magnet poses and fields; return recording, network file and row count.
 
     `table` has one row per sensor and pose: `id`, `timestamp` [s], `Bx By Bz` [µT, sensor frame,
     including the background], `sensor_x..z` [mm], `sensor_ox..oz` (rotation vector, sensor to

@@ -19,8 +19,7 @@ from mag_tracking.recording.mcap_file import McapFile
 from mag_tracking.recording.message_block import MessageBlock, Progress
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
-"""Suffixes of the files that are read in a folder. A file that is given itself may have any
-name."""
+"""Suffixes of the files that are read in a folder; a file given itself may have any name."""
 _COMPRESSED_SUFFIXES = {'.zstd': 'zstd', '.zst': 'zstd', '.lz4': 'lz4'}
 """Suffixes that the compression of whole files in rosbag2 adds, and the names of the programs."""
 
@@ -85,8 +84,7 @@ class Recording:
 
     def blocks(self, start_ns: int | None = None, progress: Progress | None = None
                ) -> Iterator[MessageBlock]:
-        """Iterate over blocks of messages; unlike in `messages`, some before `start_ns` may
-        remain."""
+        """Iterate over blocks of messages, of which some may be before `start_ns`."""
         for file in self._opened:
             for block in file.blocks(start_ns, progress):
                 for kind in block.kinds.values():
@@ -136,7 +134,6 @@ def _listed_file(file: Path) -> Path:
 
 
 def _open(file: Path, losses: 'Counter[str]') -> McapFile | BagFile:
-    """Open a file with the reader of its content; raises RecordingError."""
     try:
         with open(file, 'rb') as stream:
             head = stream.read(HEAD_SIZE)

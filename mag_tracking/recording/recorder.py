@@ -11,58 +11,38 @@ import os
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
+from mag_tracking.recording import writer
 from mag_tracking.recording.repair import finish_file
-from mag_tracking.recording.writer import (
-    FileSummary,
-    McapFileWriter,
-    Opener,
-    Topic,
-    check_no_recording,
-    offered_qos,
-    open_locked,
-    write_metadata,
-)
 
 FLUSH_INTERVAL_NS = 400_000_000
-"""Interval between flushes [ns]. A crash loses the messages of at most one flush interval plus one
-tick interval."""
+"""Interval between flushes [ns]. A crash loses at most one flush and one tick interval."""
 MIN_FREE_BYTES = 4 << 20
 """Minimum free disk space for a new file after a failure [bytes]."""
 _Message: TypeAlias = tuple[int, bytes, int, int]
 """Sequence number, CDR, log time [ns] and publish time [ns]."""
 
 
-class Recorder:
+class Recorder(AbstractContextManager['Recorder']):
     """Records messages in a rosbag2 folder, in a sequence of files.
 
-    While the disk is full, messages are dropped, counted and reported; once space is available,
-    recording continues in a new file. `opener` creates a file and returns an unbuffered stream.
-    Raises OutputError if the folder contains a recording or cannot be written.
-
-    Parameters
-    ----------
-    split_bytes, split_ns : size and duration after which a new file begins
-    retry_ns : delay before the next attempt after a failure
-
-    Attributes
-    ----------
-    counts : number of recorded messages by topic
-    dropped : number of messages by topic that could not be written
-    repeated : number of latched messages repeated at the start of a file, which makes it
-        self-contained
-    unfinished : files without an index
+    A new file begins after `split_bytes` or `split_ns`. While the disk is full, messages are
+    dropped and reported, and a new file is attempted every `retry_ns`. `counts` and `dropped` are
+    numbers of messages by topic, `repeated` that of latched messages at the starts of files, which
+    makes these complete; `unfinished` files have no index. `opener` creates a file and returns an
+    unbuffered stream. Raises OutputError if the folder contains a recording or cannot be written.
     """
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
                  split_ns: int = 3600 * 10**9, retry_ns: int = 2 * 10**9,
-                 report: Callable[[str], object] = print, opener: Opener = open_locked) -> None:
+                 report: Callable[[str], object] = print,
+                 opener: writer.Opener = writer.open_locked) -> None:
         self.folder = checked_path(folder, OutputError)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
@@ -70,23 +50,20 @@ class Recorder:
         self.dropped: Counter[str] = Counter()
         self.repeated = 0
         self.unfinished: list[Path] = []
-        self._summaries: list[FileSummary] = []
-        self._topics: dict[str, Topic] = {}
+        self._summaries: list[writer.FileSummary] = []
+        self._topics: dict[str, writer.Topic] = {}
         self._latched: dict[str, deque[_Message]] = {}
         self._sequence: Counter[str] = Counter()
         self._now_ns = self._flushed_ns = self._retry_at_ns = self._metadata_at_ns = \
             self._finished_bytes = 0
-        self._file: McapFileWriter | None = None
+        self._file: writer.McapFileWriter | None = None
         self._opened_ns: int | None = None
         self._is_failing = self._metadata_is_stale = False
-        check_no_recording(self.folder)
+        writer.check_no_recording(self.folder)
         try:
             self._open_next()
         except OSError as error:
             raise OutputError(f'cannot record in {self.folder}: {error.strerror}') from error
-
-    def __enter__(self) -> 'Recorder':
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -105,13 +82,13 @@ class Recorder:
         of `offered_qos`.
         """
         # All files use the same profile, because readers use it to match channels across files.
-        self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
+        self._topics.setdefault(
+            name, writer.Topic(type_name, definition, qos or writer.offered_qos()))
         if latched:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a CDR message of a registered topic, received at `log_ns`, or count it as
-        dropped."""
+        """Record a CDR message of a topic, received at `log_ns`, or count it as dropped."""
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
         if self._file and self._file.counts and self._file.size >= self._split_bytes:
@@ -152,7 +129,7 @@ class Recorder:
             self._report(f'the recording {self.folder} could not be completed: free disk space, '
                          f'then run mag-tracking repair {self.folder}')
 
-    def _attempt(self, file: McapFileWriter, action: Callable[..., None], *arguments: object
+    def _attempt(self, file: writer.McapFileWriter, action: Callable[..., None], *arguments: object
                  ) -> bool:
         """Call `action` on the open file; abandon the file on failure. Return True on success."""
         try:
@@ -162,20 +139,19 @@ class Recorder:
             return False
         return True
 
-    def _finish(self, file: McapFileWriter) -> None:
+    def _finish(self, file: writer.McapFileWriter) -> None:
         if self._attempt(file, file.flush) and self._attempt(file, file.finish):
             self._report_recovery()
             self._add_finished(file)
             self._file = None
             self._write_metadata()
 
-    def _add_finished(self, file: McapFileWriter) -> None:
+    def _add_finished(self, file: writer.McapFileWriter) -> None:
         self._summaries.append(file.summary())
         self._finished_bytes += file.size
 
-    def _abandon(self, file: McapFileWriter, error: OSError) -> None:
-        """Close the open file at its last complete chunk, count the lost messages, and schedule a
-        retry."""
+    def _abandon(self, file: writer.McapFileWriter, error: OSError) -> None:
+        """Close the file at its last complete chunk, count lost messages, and schedule a retry."""
         self._file = None
         lost_counts = file.pending if file.path.exists() else file.counts
         self.dropped += lost_counts
@@ -196,7 +172,7 @@ class Recorder:
                          'until writing is possible again')
         self._is_failing = True
 
-    def _reopen(self, log_ns: int) -> McapFileWriter | None:
+    def _reopen(self, log_ns: int) -> writer.McapFileWriter | None:
         """Open a new file with the latched messages; return None if that is not possible yet."""
         if self._is_failing and self._now_ns < self._retry_at_ns:
             return None
@@ -221,7 +197,7 @@ class Recorder:
         self.folder.mkdir(parents=True, exist_ok=True)
         paths = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
                  for n in itertools.count(len(self._summaries)))
-        file = McapFileWriter(next(p for p in paths if not p.exists()), self._opener)
+        file = writer.McapFileWriter(next(p for p in paths if not p.exists()), self._opener)
         try:
             file.start()
             for name, messages in self._latched.items():
@@ -237,10 +213,9 @@ class Recorder:
         self._write_metadata()
 
     def _write_metadata(self) -> None:
-        """Update `metadata.yaml`, or schedule a retry."""
         files = self._summaries + ([self._file.summary()] if self._file else [])
         try:
-            write_metadata(self.folder, files, self._topics, self._opener)
+            writer.write_metadata(self.folder, files, self._topics, self._opener)
             self._metadata_is_stale = False
         except OSError:
             # Messages have priority: recording continues without up-to-date metadata.

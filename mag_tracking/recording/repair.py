@@ -1,7 +1,6 @@
 """Repair of recordings that a crash or a full disk has truncated, by writing the missing index."""
 
 import fcntl
-import io
 import shutil
 import struct
 import zlib
@@ -22,31 +21,10 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Schema, St
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
-from mag_tracking.recording import core
+from mag_tracking.recording import core, mcap_file, writer
 from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
 from mag_tracking.recording.expansion import DECODE_ERRORS, largest_chunk
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
-from mag_tracking.recording.mcap_file import (
-    CONTENT,
-    MAGIC,
-    MIN_BYTES_PER_MESSAGE,
-    RECORD_HEADER,
-    McapFile,
-    Record,
-    chunk_content,
-    chunk_header,
-    definitions_of,
-    file_size,
-    read_summary,
-    records,
-)
-from mag_tracking.recording.writer import (
-    MESSAGE_HEADER,
-    FileSummary,
-    Topic,
-    UnbufferedWriter,
-    write_metadata,
-)
 
 
 class _Scan:
@@ -58,13 +36,13 @@ class _Scan:
         self.counts: Counter[int] = Counter()
         self.times: list[int] = []
         self.chunks: list[ChunkIndex] = []
-        self.end, self.damaged, self.n_from_cut_chunk = len(MAGIC), 0, 0
+        self.end, self.damaged, self.n_from_cut_chunk = len(mcap_file.MAGIC), 0, 0
         self.has_data_end = self._is_damaged = False
         self._stream, self._limit = stream, largest_chunk()
         self._rows: IntArray = np.zeros((0, 4), dtype=np.int64)
         self._appended = b''
-        size = file_size(stream)
-        for record in records(stream, self.end, size):
+        size = mcap_file.file_size(stream)
+        for record in mcap_file.records(stream, self.end, size):
             self.has_data_end = record.opcode in (Opcode.DATA_END, Opcode.FOOTER)
             if self.has_data_end or record.opcode == 0:
                 break
@@ -80,30 +58,34 @@ class _Scan:
         if self._lacks_index():
             self._rebuild_index()
 
-    def _add_record(self, record: Record) -> None:
+    def _add_record(self, record: mcap_file.Record) -> None:
         """Add a complete record; raises one of `DECODE_ERRORS` if it is damaged."""
         if record.opcode == Opcode.CHUNK:
             if self._lacks_index():
                 self._drop_index()
             # The message indexes of a damaged chunk are not used.
             self._is_damaged = True
-            self._add_chunk(record)
+            header = mcap_file.chunk_header(self._stream, record)
+            data = mcap_file.chunk_content(self._stream, record, self._limit)
+            self._rows, _ = self._add_content(data)
+            self.chunks.append(ChunkIndex(
+                record.end - record.begin, record.begin, header.compression, header.size,
+                header.end_ns, 0, {}, header.start_ns, len(data)))
             self._is_damaged = False
-        elif record.opcode in CONTENT:
+        elif record.opcode in mcap_file.CONTENT:
             self._stream.seek(record.begin)
             self._add_content(self._stream.read(record.end - record.begin))
         elif record.opcode == Opcode.MESSAGE_INDEX and self.chunks and not self._is_damaged:
-            self._stream.seek(record.begin + RECORD_HEADER.size)
+            self._stream.seek(record.begin + mcap_file.RECORD_HEADER.size)
             (channel,) = struct.unpack('<H', self._stream.read(2))
             self.chunks[-1].message_index_offsets[channel] = record.begin
             self.chunks[-1].message_index_length += record.end - record.begin
 
     def _add_content(self, data: bytes) -> tuple[IntArray, int]:
-        """Add records; return the rows of their messages, as `records_of`, and the length of the
-        complete records."""
+        """Add records; return the rows of their messages and the length of the complete records."""
         rows, definitions, end = core.records_of(
-            data, 2**63 - 1, self._limit // MIN_BYTES_PER_MESSAGE)
-        for definition in definitions_of(data, definitions):
+            data, 2**63 - 1, self._limit // mcap_file.MIN_BYTES_PER_MESSAGE)
+        for definition in mcap_file.definitions_of(data, definitions):
             if isinstance(definition, Schema):
                 self.schemas[definition.id] = definition
             else:
@@ -114,19 +96,11 @@ class _Scan:
             self.times = [min(times), max(times)]
         return rows, end
 
-    def _add_chunk(self, record: Record) -> None:
-        header = chunk_header(self._stream, record)
-        data = chunk_content(self._stream, record, self._limit)
-        self._rows, _ = self._add_content(data)
-        self.chunks.append(ChunkIndex(
-            record.end - record.begin, record.begin, header.compression, header.size,
-            header.end_ns, 0, {}, header.start_ns, len(data)))
-
-    def _recover_chunk(self, record: Record) -> None:
+    def _recover_chunk(self, record: mcap_file.Record) -> None:
         """Write the complete records at the beginning of a cut chunk as a new chunk."""
         if record.opcode != Opcode.CHUNK:
             return
-        data = chunk_content(self._stream, record, self._limit)
+        data = mcap_file.chunk_content(self._stream, record, self._limit)
         rows, end = self._add_content(data)
         if not len(rows):
             return
@@ -160,9 +134,9 @@ class _Scan:
         for channel in dict.fromkeys(self._rows[:, 0].tolist()):
             chunk.message_index_offsets[channel] = end + len(indexes)
             rows = self._rows[self._rows[:, 0] == channel]
-            entries = np.stack((rows[:, 1], rows[:, 2] - MESSAGE_HEADER), axis=1).astype('<u8')
-            indexes += RECORD_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes) + struct.pack(
-                '<HI', channel, entries.nbytes) + entries.tobytes()
+            entries = rows[:, 1:3].astype('<u8') - np.array([0, writer.MESSAGE_HEADER], '<u8')
+            indexes += mcap_file.RECORD_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes) \
+                + struct.pack('<HI', channel, entries.nbytes) + entries.tobytes()
         chunk.message_index_length = len(indexes)
         self._appended += indexes
 
@@ -181,7 +155,7 @@ class _Scan:
         crc = zlib.crc32(struct.pack('<BQQQ', Opcode.FOOTER, 20, start, 0), zlib.crc32(summary))
         Footer(start, 0, crc).write(builder)
         footer: bytes = builder.end()
-        return data_end + summary + footer + MAGIC
+        return data_end + summary + footer + mcap_file.MAGIC
 
 
 def finish_file(path: str | PathLike[str]) -> list[str]:
@@ -199,9 +173,9 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
         head = stream.read(HEAD_SIZE)
         if head.startswith((SQLITE_MAGIC, ROS1_MAGIC)):
             raise RecordingError(f'{path} is a bag: only MCAP files can be repaired')
-        if not head.startswith(MAGIC):
+        if not head.startswith(mcap_file.MAGIC):
             raise RecordingError(describe_file(path))
-        if read_summary(stream) is not None:
+        if mcap_file.read_summary(stream) is not None:
             return []
         scan = _Scan(stream)
         n_cut = 0 if scan.has_data_end else path.stat().st_size - scan.end
@@ -209,28 +183,19 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
             stream.seek(scan.end)
             with new_binary_file(f'{path}.cut') as cut:
                 shutil.copyfileobj(stream, cut)
-        _replace_end(raw, scan.end, scan.index())
-    lines = [f'{path.name}: index written; messages: {scan.counts.total()}']
-    if n_cut:
-        lines.append(f'{path.name}: the incomplete end was moved to {path.name}.cut; bytes: '
-                     f'{n_cut}')
-    if scan.n_from_cut_chunk:
-        lines.append(f'{path.name}: messages recovered from the incomplete chunk at the end: '
-                     f'{scan.n_from_cut_chunk}')
-    if scan.damaged:
-        lines.append(f'{path.name}: damaged chunks skipped: {scan.damaged}')
-    return lines
-
-
-def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
-    """Write the index after the intact records; on OSError, remove the incomplete index."""
-    raw.truncate(end)
-    raw.seek(end)
-    try:
-        UnbufferedWriter(raw).write(index)
-    except OSError:
-        raw.truncate(end)
-        raise
+        index = scan.index()
+        raw.truncate(scan.end)
+        raw.seek(scan.end)
+        try:
+            writer.UnbufferedWriter(raw).write(index)
+        except OSError:
+            raw.truncate(scan.end)
+            raise
+    details = {f'the incomplete end was moved to {path.name}.cut; bytes': n_cut,
+               'messages recovered from the incomplete chunk at the end': scan.n_from_cut_chunk,
+               'damaged chunks skipped': scan.damaged}
+    return [f'{path.name}: index written; messages: {scan.counts.total()}',
+            *(f'{path.name}: {text}: {n}' for text, n in details.items() if n)]
 
 
 def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
@@ -242,9 +207,9 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
         raise RecordingError(f'{path} contains no .mcap file')
     n, summaries = 0, []
     losses: Counter[str] = Counter()
-    topics: dict[str, Topic] = {}
+    topics: dict[str, writer.Topic] = {}
     # A crash at a split leaves an empty file.
-    empty_files = [file for file in files if file.stat().st_size < len(MAGIC)]
+    empty_files = [file for file in files if file.stat().st_size < len(mcap_file.MAGIC)]
     if len(empty_files) == len(files):
         raise RecordingError(f'{path} cannot be repaired: all .mcap files are empty')
     for file in empty_files:
@@ -253,7 +218,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
         try:
             lines = finish_file(file)
             if not lines:
-                for _ in McapFile(file, losses).blocks():
+                for _ in mcap_file.McapFile(file, losses).blocks():
                     pass
         except OSError as error:
             raise OutputError(f'cannot repair {file}: {error.strerror}') from error
@@ -265,7 +230,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
         raise RecordingError(f'{path}: nothing recovered: there is no complete message')
     if path.is_dir():
         try:
-            write_metadata(path, summaries, topics)
+            writer.write_metadata(path, summaries, topics)
         except OSError as error:
             raise OutputError(f'cannot write {path}/metadata.yaml: {error.strerror}') from error
     for loss, number in losses.items():
@@ -281,7 +246,7 @@ def _number(file: Path) -> tuple[int, str]:
     return (int(number) if number.isdigit() else -1, file.name)
 
 
-def _summary_of(file: Path, topics: dict[str, Topic]) -> FileSummary:
+def _summary_of(file: Path, topics: dict[str, writer.Topic]) -> writer.FileSummary:
     """Return the `FileSummary` of a complete file, and add the topics of the file to `topics`."""
     with open(file, 'rb') as stream:
         summary = make_reader(stream).get_summary()
@@ -291,9 +256,9 @@ def _summary_of(file: Path, topics: dict[str, Topic]) -> FileSummary:
     for i, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         qos = channel.metadata.get('offered_qos_profiles', '')
-        topics.setdefault(channel.topic, Topic(schema.name if schema else '', '', qos))
+        topics.setdefault(channel.topic, writer.Topic(schema.name if schema else '', '', qos))
         counts[channel.topic] += summary.statistics.channel_message_counts.get(i, 0)
     if not counts.total():
-        return FileSummary(file.name, counts)
+        return writer.FileSummary(file.name, counts)
     s = summary.statistics
-    return FileSummary(file.name, counts, s.message_start_time, s.message_end_time)
+    return writer.FileSummary(file.name, counts, s.message_start_time, s.message_end_time)

@@ -12,23 +12,9 @@ import numpy as np
 from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages import schema, types
 from mag_tracking.messages.encodings import UNDECODABLE
 from mag_tracking.messages.message_arrays import magnetic_fields
-from mag_tracking.messages.schema import (
-    MagneticField,
-    acceleration_of,
-    reading_of,
-    readings_of,
-    stamp_ns,
-)
-from mag_tracking.messages.types import (
-    FIELD_READINGS,
-    IMU,
-    MAGNETIC_FIELD,
-    RAW_READINGS,
-    RawMessage,
-    decode,
-)
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.sensor_network import absolute, namespaces_of
 from mag_tracking.recording.message_block import MessageBlock, Progress
@@ -43,14 +29,12 @@ N_FIRST_MESSAGES = 200
 MAX_FIRST_BLOCKS = 50
 """Number of blocks after which the check ends in any case."""
 MIN_DATE_S = 1e8
-"""Least timestamp that is a date, and not the time since the start of a simulation or a computer
-[s since 1970]."""
+"""Least timestamp that is a date, not the time since the start of a simulation [s since 1970]."""
 N_FRAME_CHANGES = 3
 """Number of changes of frame_id after which a topic has several sensors. A driver that was
 restarted with another frame changes it once or twice."""
 TRUTH_PREFIX = 'ground_truth/'
-"""Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
-never for tracking."""
+"""Prefix of topics with true poses in the sensors' namespace, for reports, never for tracking."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
@@ -62,8 +46,7 @@ class TopicFindings(NamedTuple):
     """Properties of the topics of sensors."""
 
     unstamped: frozenset[str]
-    """Topics whose first two messages have the timestamp 0. One such message may be the first of
-    a simulation."""
+    """Topics whose first two timestamps are 0. A single one may be the start of a simulation."""
     dated: frozenset[str]
     """Topics with timestamps since 1970, on which the timestamp 0 is missing. The timestamps of a
     simulation begin at 0."""
@@ -76,8 +59,7 @@ class TopicFindings(NamedTuple):
 
 
 def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindings:
-    """Examine the first messages of the sensors' topics; raises RecordingError if none is
-    readable."""
+    """Examine the first messages of the topics; raises RecordingError if none is readable."""
     n_zero: Counter[str] = Counter()
     n_read: Counter[str] = Counter()
     faults: Counter[str] = Counter()
@@ -87,13 +69,13 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
                 for message in block if message.topic in topics)
     for message in islice(messages, N_FIRST_MESSAGES):
         try:
-            header = decode(message).header
+            header = types.decode(message).header
         except (RecordingError, AttributeError):
             faults[fault_of(message)] += 1
             continue
-        n_zero[message.topic] += stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
+        n_zero[message.topic] += schema.stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
         n_read[message.topic] += 1
-        latest_ns[message.topic] = max(latest_ns[message.topic], stamp_ns(header.stamp))
+        latest_ns[message.topic] = max(latest_ns[message.topic], schema.stamp_ns(header.stamp))
         frames.setdefault(message.topic, set()).add(header.frame_id)
     if faults and not n_read:
         (cause, _), = faults.most_common(1)
@@ -103,28 +85,25 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
         frozenset(topic for topic, ns in latest_ns.items() if ns > MIN_DATE_S * NS), frames)
 
 
-def fault_of(message: RawMessage) -> str:
+def fault_of(message: types.RawMessage) -> str:
     """Cause for which a message cannot be read."""
     return f'{message.fault or UNDECODABLE} on {message.topic}'
 
 
 class FrameCheck:
-    """Check that each topic has the readings of one sensor."""
+    """Check that each topic has the readings of one sensor.
+
+    `numbers` are those of the latest frames by topic, as in `FieldArrays.frame`.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._frames: dict[str, list[str]] = {}
-        self._numbers: dict[str, int] = {}
-
-    def number(self, topic: str) -> int:
-        """Number of the latest frame of a topic, as in `FieldArrays.frame`; -1 if it has none
-        yet."""
-        return self._numbers.get(topic, -1)
+        self.numbers: dict[str, int] = {}
 
     def check(self, topic: str, frame: str, number: int = -1) -> None:
-        """Check the frame of a reading, and store its number; raises RecordingError if the topic
-        alternates between frames."""
-        self._numbers[topic] = number
+        """Store the frame of a reading; raises RecordingError if the topic alternates."""
+        self.numbers[topic] = number
         frames = self._frames.setdefault(topic, [frame])
         if frame == frames[-1]:
             return
@@ -144,12 +123,8 @@ class SampleReader:
     `truth` is the topic of the true poses, by default all below `TRUTH_PREFIX`. Raises
     RecordingError if the recording contains no topic of the network, its namespace is ambiguous,
     `truth` is not a topic with poses, or the messages of the sensors have another type or encoding.
-
-    Attributes
-    ----------
-    rejected : number of messages and readings that cannot be used, or not as they are, by cause
-    clocks : first and last timestamp of each sensor so far, with their log times
-    namespace : namespace of the network's relative topics in the recording
+    `rejected` counts messages and readings that cannot be used, or not as they are, by cause;
+    `namespace` is that of the network's relative topics.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork,
@@ -162,7 +137,7 @@ class SampleReader:
         for topic, name in zip(network.imu_topics, network.names, strict=True):
             if topic is not None:
                 self._imus.setdefault(absolute(topic, self.namespace), []).append(name)
-        self._batch_topic = absolute(RAW_READINGS, self.namespace)
+        self._batch_topic = absolute(types.RAW_READINGS, self.namespace)
         truth = None if truth is None else absolute(truth, self.namespace)
         self._truth = TruthTopics(absolute(TRUTH_PREFIX, self.namespace), network.frame, truth)
         if truth is not None and recording.types and not self._truth.accepts(
@@ -174,32 +149,30 @@ class SampleReader:
         self.rejected: Counter[str] = Counter()
         self._unknown_sensors: set[str] = set()
         self.clocks: dict[str, ClockSpan] = {}
-        self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
+        self._is_batched = recording.types.get(self._batch_topic) == types.FIELD_READINGS
         self._frames = FrameCheck(recording.path)
         self._found = self._examine_topics(network)
         self._shared = self._found.shared(network.names)
 
     def _examine_topics(self, network: SensorNetwork) -> TopicFindings:
-        """Check the types and the first messages of the topics."""
-        types = self._recording.types
-        topics = [topic for topic in self._sensors if topic in types]
+        kinds = self._recording.types
+        topics = [topic for topic in self._sensors if topic in kinds]
         for topic in topics:
-            if types[topic] != MAGNETIC_FIELD:
-                raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
-                                     f'{MAGNETIC_FIELD} in tesla: convert the messages')
+            if kinds[topic] != types.MAGNETIC_FIELD:
+                raise RecordingError(f'{self._recording.path}: {topic} carries {kinds[topic]}, not '
+                                     f'{types.MAGNETIC_FIELD} in tesla: convert the messages')
         if self._is_batched:
             return TopicFindings(frozenset(), frozenset(), {})
         found = examine_topics(self._recording, topics or [
-            topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
-        if types and not topics and not found.shared(network.names):
+            topic for topic, kind in kinds.items() if kind == types.MAGNETIC_FIELD])
+        if kinds and not topics and not found.shared(network.names):
             raise RecordingError(
                 f'{self._recording.path} has none of the network\'s topics '
-                f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
+                f'({", ".join(self._sensors)}); {_candidates(kinds, found.frames)}')
         return found
 
     def missing_topics(self) -> list[str]:
-        """Topics of the network that are not in the recording; none if one topic carries several
-        sensors."""
+        """Topics of the network that were not recorded; none if one topic has several sensors."""
         if self._is_batched or self._shared:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
@@ -219,8 +192,8 @@ class SampleReader:
     def _block_readings(self, block: MessageBlock) -> Readings:
         """Decode the readings in a block, in order of log time, and collect the true poses."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
-                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr
-                 and kind.topic not in self._shared}
+                 if kind.topic in self._sensors and kind.type == types.MAGNETIC_FIELD
+                 and kind.is_cdr and kind.topic not in self._shared}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
         # Messages without a timestamp are decoded individually.
@@ -248,13 +221,12 @@ class SampleReader:
         return Readings.joined([*parts, batch.part(slice(n_added, None))])
 
     def _check_frames(self, block: MessageBlock, rows: IntArray, frames: IntArray) -> None:
-        """Check the frames, numbered (k,), of the messages `rows` (k,) of a block."""
         expected = np.full(max(block.kinds, default=0) + 1, -1, dtype=np.int64)
         for number, kind in block.kinds.items():
-            expected[number] = self._frames.number(kind.topic)
+            expected[number] = self._frames.numbers.get(kind.topic, -1)
         for i in np.flatnonzero(frames != expected[block.channel[rows]]):
             message = block.message(int(rows[i]))
-            self._frames.check(message.topic, decode(message).header.frame_id, int(frames[i]))
+            self._frames.check(message.topic, types.decode(message).header.frame_id, int(frames[i]))
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -269,23 +241,23 @@ class SampleReader:
         messages = self._recording.messages(progress=progress)
         return (record for record, _ in self._records(messages, self._imus))
 
-    def _records(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
+    def _records(self, messages: Iterable[types.RawMessage], imus: Mapping[str, Sequence[str]]
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
         """Decode messages to (record, log time [ns]), collect the true poses, and count the
         messages that cannot be decoded; `imus` maps topics of accelerations to sensors."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             is_truth = self._truth.accepts(message.topic, message.type)
-            is_batch = message.topic == self._batch_topic and message.type == FIELD_READINGS
-            imu_sensors = imus.get(message.topic) if message.type == IMU else None
+            is_batch = message.topic == self._batch_topic and message.type == types.FIELD_READINGS
+            imu_sensors = imus.get(message.topic) if message.type == types.IMU else None
             is_shared = message.topic in self._shared
             if sensor is None and not (is_shared or imu_sensors or is_truth or is_batch):
                 continue
             try:
-                if (sensor is not None or is_shared) and message.type != MAGNETIC_FIELD:
+                if (sensor is not None or is_shared) and message.type != types.MAGNETIC_FIELD:
                     raise RecordingError(f'{message.topic} carries {message.type}')
-                content = decode(message)
-                readings = readings_of(content) if is_batch else None
+                content = types.decode(message)
+                readings = schema.readings_of(content) if is_batch else None
             except RecordingError:
                 self.rejected[fault_of(message)] += 1
                 continue
@@ -297,7 +269,7 @@ class SampleReader:
                 yield readings, message.log_time_ns
             elif imu_sensors is not None:
                 for name in imu_sensors:
-                    yield acceleration_of(content, name), message.log_time_ns
+                    yield schema.acceleration_of(content, name), message.log_time_ns
             elif sensor is not None or is_shared:
                 frame = content.header.frame_id
                 if not is_shared:
@@ -305,11 +277,10 @@ class SampleReader:
                 yield from self._single(content, frame if sensor is None or is_shared else sensor,
                                         message)
 
-    def _single(self, content: MagneticField, sensor: str, message: RawMessage
+    def _single(self, content: schema.MagneticField, sensor: str, message: types.RawMessage
                 ) -> Iterator[tuple[Readings, int]]:
-        """Convert a decoded message unless its sensor is not in the network or its time is
-        missing."""
-        reading = self._network_readings(reading_of(content, sensor))
+        """Convert a message unless its sensor is not in the network or its time is missing."""
+        reading = self._network_readings(schema.reading_of(content, sensor))
         if not reading.stamp_ns.all():
             cause = f'{ZERO_STAMP} on {message.topic}'
             if message.topic in self._found.unstamped:
@@ -334,7 +305,6 @@ class SampleReader:
             self.clocks[readings.names[j]] = earlier.until(span)
 
     def _network_readings(self, readings: Readings) -> Readings:
-        """Select the readings of the network's sensors, and count readings of other sensors."""
         network_sensors = set(self._sensors.values())
         is_known = np.array([name in network_sensors for name in readings.names],
                             dtype=bool)[readings.sensor]
@@ -354,12 +324,11 @@ class SampleReader:
         return self._truth.arrays()
 
 
-def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
-    """Format the topics with magnetic fields and several `frames`, or else all topics."""
+def _candidates(kinds: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
     fields = [topic + (f' (with the frame_ids {", ".join(sorted(frames[topic]))})'
                        if len(frames.get(topic, ())) > 1 else '')
-              for topic, kind in sorted(types.items()) if kind == MAGNETIC_FIELD]
-    topics = [f'{topic} ({kind})' for topic, kind in sorted(types.items())[:MAX_TOPICS]]
+              for topic, kind in sorted(kinds.items()) if kind == types.MAGNETIC_FIELD]
+    topics = [f'{topic} ({kind})' for topic, kind in sorted(kinds.items())[:MAX_TOPICS]]
     return f'topics with magnetic fields: {", ".join(fields)}' if fields else \
         f'topics with magnetic fields: none found; topics: {", ".join(topics)}'
 
@@ -370,8 +339,8 @@ def _namespace(recording: Recording, network: SensorNetwork) -> str:
     if network.namespace is not None:
         return network.namespace
     names = [name for name, kind in recording.types.items()
-             if kind in (MAGNETIC_FIELD, FIELD_READINGS)]
-    found = namespaces_of((*network.topics, RAW_READINGS), names)
+             if kind in (types.MAGNETIC_FIELD, types.FIELD_READINGS)]
+    found = namespaces_of((*network.topics, types.RAW_READINGS), names)
     if len(found) > 1:
         raise RecordingError(f'{recording.path} has the topics of the network in the namespaces '
                              f'{", ".join(found)}: choose one with --namespace')

@@ -68,8 +68,7 @@ def read_signatures(path: FilePath, is_labelled: bool = True) -> list[Signature]
 
 
 def _read_by_sample(table: CsvTable) -> list[Signature]:
-    """Read a table with one row per sample; the columns without field, label, time or pass identify
-    the signature."""
+    """Read a table with one row per sample, whose remaining columns identify the signature."""
     path, header = table.path, table.header
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
@@ -96,8 +95,7 @@ def _read_by_sample(table: CsvTable) -> list[Signature]:
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Value that all rows have in a column, '' if it is missing; raises LabelsError if they
-    differ."""
+    """Value of all rows in a column, '' if it is missing; raises LabelsError if they differ."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -132,8 +130,7 @@ def _read_by_row(table: CsvTable) -> list[Signature]:
 
 
 class _Fields:
-    """Field columns of a table by axis, from `columns`: [(axis, unit, names)]; raises LabelsError
-    if they are inconsistent."""
+    """Field columns of a table, [(axis, unit, names)]; raises LabelsError if inconsistent."""
 
     def __init__(self, path: FilePath, columns: list[tuple[str, str, list[str]]]) -> None:
         columns = sorted(columns)
@@ -220,22 +217,17 @@ def read_model(path: FilePath) -> SignatureModel:
     try:
         with open(path, encoding='utf-8') as stream:
             content = json.load(stream)
+        if isinstance(content, dict) and content.get(_VERSION_ENTRY, VERSION) != VERSION:
+            raise RecordingError(f'{path}: format version {content[_VERSION_ENTRY]} is not '
+                                 f'supported; expected {VERSION}')
+        return _parse_model(content)
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
     except (ValueError, RecursionError) as error:
-        raise RecordingError(f'{path} is not a valid file of trained classes: '
-                             'it is not valid JSON') from error
-    if isinstance(content, dict) and content.get(_VERSION_ENTRY, VERSION) != VERSION:
-        raise RecordingError(f'{path}: format version {content[_VERSION_ENTRY]} is not supported; '
-                             f'expected {VERSION}')
-    try:
-        return _parse_model(content)
-    except ValueError as error:
         raise RecordingError(f'{path} is not a valid file of trained classes: {error}') from error
 
 
 def _parse_model(content: Any) -> SignatureModel:
-    """Create a model from the content of its file; a ValueError names the invalid entry."""
     if not isinstance(content, dict):
         raise ValueError('expected a mapping of entries')
     names = [field.name for field in fields(SignatureModel)]
@@ -261,7 +253,6 @@ def _parse_entry(name: str, value: Any) -> Any:
 
 
 def _check_model(model: SignatureModel) -> None:
-    """Raise ValueError if the arrays of a model are inconsistent or not finite."""
     n, k = len(model.mean), len(set(model.classes))
     if k < 2 or k < len(model.classes):
         raise ValueError('classes: expected at least two different names')

@@ -90,8 +90,7 @@ def parse_columns(texts: Sequence[str]) -> _Assigned:
 
 
 def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -> str:
-    """Name of a sensor from a text at `where`, by `names` or as `mag_3` for 3; raises
-    RecordingError."""
+    """Sensor name of a text at `where`, by `names` or as `mag_3` for 3; raises RecordingError."""
     text = text.strip()
     if names and text in names:
         return names[text]
@@ -190,7 +189,6 @@ def _time_unit_of(table: Table, j: int) -> str:
 
 
 def _by_header(table: Table) -> _Assigned:
-    """Find the columns by their names; raises RecordingError if they are not clear."""
     if table.header is None:
         n = len(table.rows[0][1])
         raise RecordingError(f'{table.path} has no header line; give the numbers of its {n} '
@@ -265,7 +263,6 @@ def _axis_of(words: Sequence[str]) -> tuple[str, str] | None:
 
 
 def _assignment_note(time: str, sensor: str | None, axes: Mapping[str, Mapping[str, str]]) -> str:
-    """Describe columns that were found by their names."""
     parts = [f'time={time}'] if time else []
     parts += [f'sensor={sensor}'] if sensor else []
     parts += [f'{name}.{axis}={column}' if name else f'{axis}={column}'

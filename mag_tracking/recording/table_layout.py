@@ -7,22 +7,13 @@ from pathlib import Path
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.table_text import (
-    COMMENTS,
-    SEPARATORS,
-    Lines,
-    find_separator,
-    is_missing,
-    is_value,
-    read_text,
-    split_line,
-)
+from mag_tracking.recording import table_text
 from mag_tracking.units import field_unit, time_unit
 
 SAMPLE_LINES = 400
 MAX_BAD_FRACTION = 0.1
 """Maximum fraction of rows that may be unusable."""
-_SEPARATOR_NAMES = {name: separator for separator, name in SEPARATORS.items()}
+_SEPARATOR_NAMES = {name: separator for separator, name in table_text.SEPARATORS.items()}
 
 
 @dataclass
@@ -35,7 +26,7 @@ class Table:
     """Cells of the line of units; empty without one."""
     header_line: int
     """Number of the header line; 0 without one."""
-    rows: Lines
+    rows: table_text.Lines
     separator: str
     notes: list[str]
     """What was found out: encoding, separator, header."""
@@ -45,8 +36,7 @@ class Table:
     """Line number and fault of each unusable row."""
 
     def check_bad_rows(self, n_good: int) -> None:
-        """Raise the first fault as RecordingError if more than `MAX_BAD_FRACTION` of the rows, or
-        all, are unusable."""
+        """Raise the first fault as RecordingError if too many rows, or all, are unusable."""
         n, n_bad = n_good + len(self.bad), len(self.bad)
         if n_bad > MAX_BAD_FRACTION * n:
             line, fault = min(self.bad)
@@ -60,7 +50,7 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
 
     `separator` may be a name in `SEPARATORS`; `header` is a line number, 0 for none.
     """
-    lines, found_encoding = read_text(path, encoding)
+    lines, found_encoding = table_text.read_text(path, encoding)
     numbers = [k for k, line in enumerate(lines) if line.strip()]
     if not numbers:
         raise RecordingError(f'{path} has no rows')
@@ -73,7 +63,7 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
     # Preamble and header come first.
     sample = numbers[max(len(numbers) // 4, header != 0):]
     sample = sample[::max(1, len(sample) // SAMPLE_LINES)]
-    separator = separator or find_separator([lines[k] for k in sample]) or ''
+    separator = separator or table_text.find_separator([lines[k] for k in sample]) or ''
     if not separator:
         raise RecordingError(f'{path} is not a table: no separator splits line {numbers[0] + 1}, '
                              f'{lines[numbers[0]][:40]!r}; give --separator')
@@ -82,7 +72,7 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
     names, units, header_line = _header(lines, above, separator, n, header)
     if names is not None and header_line is not None:
         n = _checked_width(path, lines, first, separator, names, n, header_line)
-    notes = [f'separator {SEPARATORS.get(separator, separator)}',
+    notes = [f'separator {table_text.SEPARATORS.get(separator, separator)}',
              *([] if found_encoding in ('utf-8', 'utf-8-sig') else [f'encoding {found_encoding}']),
              f'header in line {header_line + 1}' if header_line is not None else 'no header',
              *(['line of units'] if units else [])]
@@ -102,15 +92,15 @@ def _first_row(path: Path, lines: list[str], numbers: list[int], sample: list[in
     """Return (number of cells of a row, index of the first line with a row)."""
     if header is not None and not 0 <= header <= len(lines):
         raise RecordingError(f'--header: the file has {len(lines)} lines, got {header}')
-    widths = Counter(len(cells) for cells in (split_line(lines[k], separator) for k in sample)
-                     if _is_row(cells))
+    sampled = (table_text.split_line(lines[k], separator) for k in sample)
+    widths = Counter(len(cells) for cells in sampled if _is_row(cells))
     if not widths:
         raise RecordingError(f'{path} has no rows of numbers separated by '
-                             f'{SEPARATORS.get(separator, separator)}; if the separator is '
-                             'another one, give --separator')
+                             f'{table_text.SEPARATORS.get(separator, separator)}; if the separator '
+                             'is another one, give --separator')
     # Lines of a preamble may outnumber the rows, but have fewer cells.
     n = max(widths, key=lambda width: width * widths[width])
-    rows = ((k, split_line(lines[k], separator)) for k in numbers if k >= (header or 0))
+    rows = ((k, table_text.split_line(lines[k], separator)) for k in numbers if k >= (header or 0))
     first = next((k for k, cells in rows if len(cells) == n and _is_row(cells)), None)
     if first is None:
         raise RecordingError(f'{path} has no rows of {n} cells after line {header}, the header')
@@ -119,15 +109,15 @@ def _first_row(path: Path, lines: list[str], numbers: list[int], sample: list[in
 
 def _is_row(cells: Sequence[str]) -> bool:
     """Whether at least half of the cells that are not missing are numbers or times."""
-    present = [cell for cell in cells if not is_missing(cell)]
-    return len(cells) > 1 and 2 * sum(map(is_value, present)) >= len(present) > 0 \
-        and not cells[0].startswith(COMMENTS)
+    present = [cell for cell in cells if not table_text.is_missing(cell)]
+    return len(cells) > 1 and 2 * sum(map(table_text.is_value, present)) >= len(present) > 0 \
+        and not cells[0].startswith(table_text.COMMENTS)
 
 
 def _header(lines: list[str], above: list[int], separator: str, n: int, header: int | None
             ) -> tuple[list[str] | None, list[str], int | None]:
     """Return (names of the columns, line of units, index of the header line)."""
-    candidates = [k for k in above if not _is_row(split_line(lines[k], separator))
+    candidates = [k for k in above if not _is_row(table_text.split_line(lines[k], separator))
                   ] if header is None else [k for k in above if k >= header - 1]
     if header == 0 or not candidates:
         return None, [], None
@@ -144,7 +134,7 @@ def _header(lines: list[str], above: list[int], separator: str, n: int, header: 
         cells = _header_cells(lines[candidates[-1]], separator)
     if header is not None:
         return _header_cells(lines[header - 1], separator), units, header - 1
-    is_comment = lines[candidates[-1]].startswith(COMMENTS)
+    is_comment = lines[candidates[-1]].startswith(table_text.COMMENTS)
     if len(cells) < 2 or is_comment and len(cells) != n:
         return None, units, None
     return cells, units, candidates[-1]
@@ -152,14 +142,15 @@ def _header(lines: list[str], above: list[int], separator: str, n: int, header: 
 
 def _header_cells(line: str, separator: str) -> list[str]:
     """Split a header line, which may begin like a comment."""
-    return split_line(line.lstrip('#%/ ') if line.startswith(COMMENTS) else line, separator)
+    line = line.lstrip('#%/ ') if line.startswith(table_text.COMMENTS) else line
+    return table_text.split_line(line, separator)
 
 
 def _is_units(cells: Sequence[str]) -> bool:
     """Whether a line consists of units of fields and times, and of empty or other short cells."""
     units = [cell for cell in cells if field_unit(cell) and len(cell.strip('[](){} ')) > 1
              or cell.strip('[](){} ') in ('T', 'G')]
-    others = [cell for cell in cells if cell not in units and not is_missing(cell)
+    others = [cell for cell in cells if cell not in units and not table_text.is_missing(cell)
               and not time_unit(cell) and not cell.startswith(('[', '('))]
     return bool(units) and len(others) <= len(units)
 
@@ -169,8 +160,8 @@ def _checked_width(path: Path, lines: list[str], first: int, separator: str, nam
     """Compare header and rows; remove empty names at the end. Return the number of columns."""
     while names and not names[-1] and len(names) > n:
         names.pop()
-    cells = split_line(lines[first], separator)
-    if len(names) < n and all(is_missing(cell) for cell in cells[len(names):]):
+    cells = table_text.split_line(lines[first], separator)
+    if len(names) < n and all(table_text.is_missing(cell) for cell in cells[len(names):]):
         return len(names)
     if len(names) == n:
         return n
@@ -189,10 +180,10 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
     header = table.header
     for k in numbers:
         line = lines[k]
-        if line.startswith(COMMENTS):
+        if line.startswith(table_text.COMMENTS):
             table.ignored['comment line'] += 1
             continue
-        cells = split_line(line, table.separator)
+        cells = table_text.split_line(line, table.separator)
         if len(cells) > n and not any(cells[n:]):
             del cells[n:]
         if k == len(lines) - 1 and len(cells) == n and _is_cut(cells[-1], table.rows):
@@ -209,8 +200,9 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
             table.bad.append((k + 1, f'{quantity(len(cells), "cell")}, expected {n}'))
 
 
-def _is_cut(cell: str, rows: Lines) -> bool:
+def _is_cut(cell: str, rows: table_text.Lines) -> bool:
     """Whether the last cell of a file has fewer decimals than all other cells of its column."""
+    is_missing = table_text.is_missing
     others = [cells[-1] for _, cells in rows if is_missing(cells[-1]) == is_missing(cell)]
     return bool(rows) and _n_decimals(cell) < min(map(_n_decimals, others), default=1)
 

@@ -44,8 +44,7 @@ _POINT_DECIMALS = re.compile(
 
 
 def read_text(path: FilePath, encoding: str = '') -> tuple[list[str], str]:
-    """Lines (without ends and NUL characters) and encoding of a text file; raises RecordingError
-    if the file is not text."""
+    """Lines (without ends and NUL) and encoding of a text file; raises RecordingError if binary."""
     path = checked_path(path, RecordingError)
     try:
         data, kind = path.read_bytes(), binary_kind(path)
@@ -87,8 +86,7 @@ def _encoding_of(data: bytes) -> str:
 
 
 def split_line(line: str, separator: str) -> list[str]:
-    """Split a line into cells without white space around; a blank separates by white space of any
-    length."""
+    """Split a line into stripped cells; a blank separates by white space of any length."""
     if '"' in line:
         try:
             # The line may end within quotes, so strictness is left to the number of cells.
@@ -102,8 +100,7 @@ def split_line(line: str, separator: str) -> list[str]:
 
 
 def find_separator(lines: Sequence[str]) -> str | None:
-    """Separator that splits most lines, mostly rows, into equal numbers of numbers and times, or
-    None."""
+    """Separator that splits most lines into equal numbers of numbers and times, or None."""
     best: tuple[float, str | None] = (0.0, None)
     for separator in SEPARATORS:
         rows = [split_line(line, separator) for line in lines]

@@ -8,22 +8,10 @@ from decimal import Context, Decimal, InvalidOperation
 from fractions import Fraction
 from typing import NamedTuple
 
+from mag_tracking import units
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.quantities import occurrences
 from mag_tracking.recording.table_text import is_missing, is_number, plain_number
-from mag_tracking.units import (
-    DATE_ORDERS,
-    DAY_NS,
-    FORMS,
-    LATEST_NS,
-    NS,
-    TIME_UNITS,
-    date_order,
-    parse_time,
-    time_scale,
-    time_unit,
-    unit_since_1970,
-)
 
 PLAUSIBLE_STEP_S = (1e-4, 0.67)
 """Range of intervals between readings that need no question about the unit of the time [s]."""
@@ -34,9 +22,9 @@ _DIGITS_OF_A_DATE = re.compile(
     '(?:19|20)[0-9]{2}[01][0-9][0-3][0-9][0-2][0-9][0-5][0-9][0-5][0-9](?:[.]?[0-9]+)?').fullmatch
 """yyyymmddhhmmss and decimals."""
 _EPOCHS = (
-    ('d', 36526, 58484, 25569 * DAY_NS, 'days since 1900 (spreadsheet)'),
-    ('d', 730486, 752444, 719529 * DAY_NS, 'days since the year 0 (MATLAB)'),
-    ('s', 3.03e9, 4.23e9, 2082844800 * NS, 's since 1904 (LabVIEW)'))
+    ('d', 36526, 58484, 25569 * units.DAY_NS, 'days since 1900 (spreadsheet)'),
+    ('d', 730486, 752444, 719529 * units.DAY_NS, 'days since the year 0 (MATLAB)'),
+    ('s', 3.03e9, 4.23e9, 2082844800 * units.NS, 's since 1904 (LabVIEW)'))
 """Unit, range of values in this century, time to subtract [ns], and name of epochs before 1970."""
 _COUNTER_LIMITS = (2**15, 2**16, 2**20, 2**24, 2**31, 2**32)
 _CLOCK_LIMITS_S = (60, 3600, 86400, 7 * 86400)
@@ -44,7 +32,7 @@ _TIME_OF_DAY = re.compile('[0-2][0-9][0-5][0-9][0-5][0-9](?:[.][0-9]+)?').fullma
 """hhmmss and decimals, as in NMEA 0183."""
 JUMPS = ('split', 'sort')
 """Meanings of a time that runs backwards: the clock restarted, or the rows are out of order."""
-MAX_GAP_NS = 5 * 365 * DAY_NS
+MAX_GAP_NS = 5 * 365 * units.DAY_NS
 """Maximum interval between two readings [ns]. A clock that is set after its start jumps farther."""
 MAX_STEPS = 5
 """Maximum interval, in median intervals, that counts as uninterrupted."""
@@ -97,11 +85,10 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
                header_unit: str, order: str) -> Times:
     """Convert the times of a table, whose series (sensors) are `keys`.
 
-    An empty `unit` or `order` of a date is found; if it is ambiguous, RecordingError names the
-    option that states it.
+    An empty `unit` or `order` of a date is found; if ambiguous, RecordingError names the option.
     """
-    if order and order not in DATE_ORDERS:
-        raise SettingsError(f'--date-order: expected one of {", ".join(DATE_ORDERS)}, got '
+    if order and order not in units.DATE_ORDERS:
+        raise SettingsError(f'--date-order: expected one of {", ".join(units.DATE_ORDERS)}, got '
                             f'{order!r}')
     n_numbers = sum(is_number(t) for t in texts)
     if n_numbers and all(_DIGITS_OF_A_DATE(t) or is_missing(t) for t in texts):
@@ -118,13 +105,12 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
     step = round(_step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
     scale, offset, notes = _unit_of(where, values, step, unit, header_unit)
     limits = (*(n * _SUB for n in _COUNTER_LIMITS),
-              *(round(s * NS / scale) for s in _CLOCK_LIMITS_S))
+              *(round(s * units.NS / scale) for s in _CLOCK_LIMITS_S))
     return Times(values, scale, offset, _SUB, limits, notes)
 
 
 def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
-    """Convert dates or times of day."""
-    found = order or date_order(texts)
+    found = order or units.date_order(texts)
     if found is None:
         raise RecordingError(
             f'{where}: the order of day, month and year is ambiguous in {texts[0]!r}; give '
@@ -134,7 +120,7 @@ def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
     fault = ''
     for text in texts:
         try:
-            time_ns, *kind = parse_time(text, found)
+            time_ns, *kind = units.parse_time(text, found)
         except ValueError as error:
             values.append(None)
             fault = fault or f'{text[:40]!r}: {error}'
@@ -143,13 +129,13 @@ def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
             kinds.add(tuple(kind))
     if not kinds or len({has_date for has_date, _ in kinds}) > 1:
         raise RecordingError(f'{where}: {fault or "only some times have a date"}; accepted are '
-                             f'numbers (--time-unit) and {FORMS}')
+                             f'numbers (--time-unit) and {units.FORMS}')
     has_date = any(has_date for has_date, _ in kinds)
     has_zone = all(has_zone for _, has_zone in kinds)
     note = 'date and time' if has_date else 'time of day'
     note += ' in UTC' if has_zone else ' without time zone, taken as UTC' if has_date else ''
-    limits = () if has_date else (3600 * NS, DAY_NS // 2, DAY_NS)
-    return Times(values, Fraction(1), 0, NS, limits, [note])
+    limits = () if has_date else (3600 * units.NS, units.DAY_NS // 2, units.DAY_NS)
+    return Times(values, Fraction(1), 0, units.NS, limits, [note])
 
 
 def _exact(text: str, decimal: str) -> int | None:
@@ -170,38 +156,38 @@ def _unit_of(where: str, values: Sequence[int | None], step: int, unit: str, hea
     low, high = (min(numbers), max(numbers)) if numbers else (0.0, 0.0)
     stated = unit or header_unit
     step_s = step / _SUB
-    known = (time_unit(stated) or stated) if stated else ''
+    known = (units.time_unit(stated) or stated) if stated else ''
     epochs = list(_EPOCHS)
-    if (since := unit_since_1970(low)) and since == unit_since_1970(high):
+    if (since := units.unit_since_1970(low)) and since == units.unit_since_1970(high):
         epochs.append((since, low, high, 0, f'{since} since 1970'))
     for name, first, last, offset, title in epochs:
-        seconds = step_s * TIME_UNITS[name] / NS
+        seconds = step_s * units.TIME_UNITS[name] / units.NS
         if first <= low <= high <= last and known in ('', name) and (
                 not step or 1e-4 <= seconds <= 100.0 or known):
-            return Fraction(TIME_UNITS[name], _SUB), offset, [f'time in {title}']
+            return Fraction(units.TIME_UNITS[name], _SUB), offset, [f'time in {title}']
     if stated:
-        scale = time_scale(stated, '--time-unit')
+        scale = units.time_scale(stated, '--time-unit')
         notes = [f'time in {stated}{"" if unit else " (header)"}']
         others = _plausible(step_s, high - low)
-        if step and not 1e-4 <= step_s * float(scale) / NS <= 2.0 and others:
-            rate = _rates(step_s * float(scale) / NS, (high - low) * float(scale) / NS)
+        if step and not 1e-4 <= step_s * float(scale) / units.NS <= 2.0 and others:
+            rate = _rates(step_s * float(scale) / units.NS, (high - low) * float(scale) / units.NS)
             notes.append(f'warning: in {stated}, the times give {rate}; --time-unit may be wrong: '
                          f'{others}')
         return scale / _SUB, 0, notes
     if not step or PLAUSIBLE_STEP_S[0] <= step_s <= PLAUSIBLE_STEP_S[1]:
-        return Fraction(NS, _SUB), 0, ['time in s']
+        return Fraction(units.NS, _SUB), 0, ['time in s']
     others = _plausible(step_s, high - low)
     raise RecordingError(
         f'{where}: as seconds, the times give {_rates(step_s, high - low)}. If that is right, give '
         f'--time-unit s; ' + (f'otherwise --time-unit with the unit: {others}' if others else
-                              f'otherwise --time-unit with one of {", ".join(TIME_UNITS)}'))
+                              f'otherwise --time-unit with one of {", ".join(units.TIME_UNITS)}'))
 
 
 def _plausible(step: float, span: float) -> str:
-    """List the units in which the interval of readings is plausible, with rate and span."""
     return ', '.join(
-        f'{name} ({_rates(step * ns / NS, span * ns / NS)})' for name, ns in TIME_UNITS.items()
-        if PLAUSIBLE_STEP_S[0] <= step * ns / NS <= PLAUSIBLE_STEP_S[1])
+        f'{name} ({_rates(step * ns / units.NS, span * ns / units.NS)})'
+        for name, ns in units.TIME_UNITS.items()
+        if PLAUSIBLE_STEP_S[0] <= step * ns / units.NS <= PLAUSIBLE_STEP_S[1])
 
 
 def _rates(step_s: float, span_s: float) -> str:
@@ -219,9 +205,9 @@ def span_text(span_s: float) -> str:
 
 def check_range(where: str, line: int, stamp_ns: int) -> None:
     """Raise RecordingError if a time is not in the range of ROS headers."""
-    if not 0 <= stamp_ns <= LATEST_NS:
-        raise RecordingError(f'{where}: row {line}: {stamp_ns / NS:.6g} s is not a valid time '
-                             'since 1970; check --time-unit')
+    if not 0 <= stamp_ns <= units.LATEST_NS:
+        raise RecordingError(f'{where}: row {line}: {stamp_ns / units.NS:.6g} s is not a valid '
+                             'time since 1970; check --time-unit')
 
 
 @dataclass

@@ -29,8 +29,7 @@ _QUATERNION, _MOMENT = ('qx', 'qy', 'qz', 'qw'), ('mx', 'my', 'mz')
 class TruthTopics:
     """Collects true poses from `topic`, or all topics below `prefix`.
 
-    Poses in other frames than the world frame of the network cannot be compared; they are counted
-    in `rejected`, by cause.
+    Poses in another frame than the world frame of the network are counted in `rejected`, by cause.
     """
 
     def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:
@@ -61,10 +60,10 @@ class TruthTopics:
         for channel, kind in block.kinds.items():
             rows: IntArray = np.flatnonzero(block.channel == channel)
             if len(rows) and kind.type == POSE and kind.is_cdr and self.accepts(kind.topic, POSE):
-                found = poses(block.data, block.begin[rows], block.end[rows], self._frame)
-                collected.append(rows[found.is_decoded])
-                self._rows.setdefault(kind.topic, []).append(
-                    (found.stamp_ns[found.is_decoded], found.pose[found.is_decoded]))
+                is_decoded, stamps, pose = poses(
+                    block.data, block.begin[rows], block.end[rows], self._frame)
+                collected.append(rows[is_decoded])
+                self._rows.setdefault(kind.topic, []).append((stamps[is_decoded], pose[is_decoded]))
         return np.concatenate(collected)
 
     def arrays(self) -> dict[str, Truth]:

@@ -6,7 +6,7 @@ import io
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import IO, NamedTuple, TypeAlias, cast
@@ -39,8 +39,7 @@ Opener: TypeAlias = Callable[[Path], io.FileIO]
 
 
 def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """QoS profile of a topic as rosbag2 writes it, YAML: reliable or best-effort, latched or
-    volatile."""
+    """QoS profile as rosbag2 writes it, YAML: reliable or best-effort, latched or volatile."""
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')
     return text.replace('durability: volatile', 'durability: transient_local') if latched else text
@@ -57,14 +56,12 @@ class Topic(NamedTuple):
 
 
 class FileSummary(NamedTuple):
-    """Entry of one file in `metadata.yaml`."""
+    """Entry of one file in `metadata.yaml`; without messages, it has no log times."""
 
     name: str
     counts: Counter[str]
     first_ns: int | None = None
-    """Log time of the first message, ns. None if the file has no messages."""
     last_ns: int | None = None
-    """Log time of the last message, ns. None if the file has no messages."""
 
 
 def open_unbuffered(path: Path) -> io.FileIO:
@@ -73,8 +70,7 @@ def open_unbuffered(path: Path) -> io.FileIO:
 
 
 def open_locked(path: Path) -> io.FileIO:
-    """Create a file as `open_unbuffered`, and lock it, if possible, against repair while it is
-    written."""
+    """Create a file as `open_unbuffered`, and lock it, if possible, against repair."""
     stream = open_unbuffered(path)
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -118,8 +114,7 @@ def check_no_recording(folder: Path) -> None:
 
 
 def check_no_other_recording(path: Path) -> None:
-    """Raise OutputError if the folder of a new MCAP file has a `metadata.yaml` that does not list
-    it."""
+    """Raise OutputError if the folder of a new file has a `metadata.yaml` that does not list it."""
     metadata = path.parent / 'metadata.yaml'
     try:
         # Only a regular file is read: a pipe or a device could block.
@@ -175,12 +170,8 @@ def _span(times: Sequence[int]) -> tuple[dict[str, int], dict[str, int]]:
 class McapFileWriter:
     """Writer of one MCAP file, which can be truncated to its complete chunks after a failure.
 
-    `opener` creates the file. Raises OSError if a write fails.
-
-    Attributes
-    ----------
-    counts : number of messages by topic, including pending ones
-    pending : number of messages by topic that are not yet in a complete chunk
+    `opener` creates the file; raises OSError if a write fails. `counts` are numbers of messages by
+    topic, `pending` those that are not yet in a complete chunk.
     """
 
     def __init__(self, path: Path, opener: Opener) -> None:
@@ -236,8 +227,7 @@ class McapFileWriter:
             name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
 
     def flush(self) -> None:
-        """Complete the current chunk, so that a crash cannot lose its messages; raises OSError also
-        if the file was removed."""
+        """Complete the chunk, so that a crash cannot lose it; raises OSError for a removed file."""
         self._complete_chunk()
         if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
             raise OSError(errno.ENOENT, 'the file was removed')
@@ -275,7 +265,7 @@ class McapFileWriter:
         return FileSummary(self.path.name, Counter(self.counts), *self._span)
 
 
-class RecordingWriter:
+class RecordingWriter(AbstractContextManager['RecordingWriter']):
     """Writes messages to an MCAP file and a `metadata.yaml` in its folder; a context manager.
 
     `latched` are the topics with transient local durability. Parent folders are created; raises
@@ -295,17 +285,13 @@ class RecordingWriter:
             raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
         self._file.start()
 
-    def __enter__(self) -> 'RecordingWriter':
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def write(self, topic: str, type_name: str, message: MessageDict, time_ns: int) -> None:
         """Append a message with its fields and log time.
 
-        Raises RecordingError if the definition of the type is unknown, OutputError beyond
-        `MAX_TOPICS`.
+        Raises RecordingError if the type is unknown, OutputError beyond `MAX_TOPICS`.
         """
         if topic not in self._topics:
             if len(self._topics) == MAX_TOPICS:

@@ -18,13 +18,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
+from mag_tracking.results import parquet_table
 from mag_tracking.results.columns import (
     FIT_STATE,
     FITS,
@@ -34,13 +35,6 @@ from mag_tracking.results.columns import (
     axes,
     columns_of,
     pick,
-)
-from mag_tracking.results.parquet_table import (
-    VERSION,
-    TableWriter,
-    check_row,
-    import_pyarrow,
-    is_complete,
 )
 from mag_tracking.units import NS
 
@@ -140,12 +134,11 @@ def _hash(text: str) -> str:
     return hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]
 
 
-class ArchiveFolder:
+class ArchiveFolder(AbstractContextManager['ArchiveFolder']):
     """Folder of an archive, locked against other runs until it is closed; a context manager.
 
-    `head` is metadata that must be identical in all runs that write to the folder. Raises
-    OutputError if the folder is neither empty nor an archive, has other metadata or another table
-    version, or is locked.
+    `head` is metadata that must be identical in all runs. Raises OutputError if the folder is
+    neither empty nor an archive, has other metadata or another table version, or is locked.
     """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -155,12 +148,12 @@ class ArchiveFolder:
                               'folder')
         self._lock = self._acquire_lock()
         try:
-            self._check_head({'schema': VERSION, **head})
+            self._check_head({'schema': parquet_table.VERSION, **head})
             for name in (_DONE, _WORK):
                 output_folder(self.path / name)
             # One pass over all tables takes less time than a search for those of each recording.
             self._damaged = {table.stem: table for table in self.path.glob('*/date=*/*.parquet')
-                             if not is_complete(table)}
+                             if not parquet_table.is_complete(table)}
         except OSError as error:
             self.close()
             raise OutputError(f'cannot read {self.path}: {error.strerror}') from error
@@ -169,7 +162,6 @@ class ArchiveFolder:
             raise
 
     def _acquire_lock(self) -> int:
-        """Acquire the exclusive lock and return its file descriptor; raises OutputError."""
         import fcntl
 
         path = self.path / _LOCK
@@ -189,22 +181,19 @@ class ArchiveFolder:
         """Release the lock."""
         os.close(self._lock)
 
-    def __enter__(self) -> 'ArchiveFolder':
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Write `head` to archive.json; raise OutputError if the file has other metadata."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
             return
         previous_head = _read_json(path)
-        if previous_head.get('schema') != VERSION:
+        if previous_head.get('schema') != parquet_table.VERSION:
             raise OutputError(f'{self.path} has tables of version {previous_head.get("schema")}; '
-                              f'this program writes version {VERSION}. Choose another folder')
+                              f'this program writes version {parquet_table.VERSION}. Choose '
+                              'another folder')
         differing_keys = sorted(key for key in {*head, *previous_head}
                                 if json.dumps(head.get(key), sort_keys=True)
                                 != json.dumps(previous_head.get(key), sort_keys=True))
@@ -231,7 +220,8 @@ class ArchiveFolder:
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
         """Remove outdated results of a recording, and create the folder for its partial results."""
         name, work = recording_key(recording), self.path / _WORK
-        folder = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
+        identity = json.dumps([parquet_table.VERSION, version(_PACKAGE), state])
+        folder = work / f'{name}.{_hash(identity)}'
         try:
             (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
             for path in self.path.glob(f'*/date=*/{glob.escape(name)}.parquet'):
@@ -245,22 +235,21 @@ class ArchiveFolder:
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  summary: Mapping[str, Any]) -> None:
-        """Mark a recording as processed, after all of its tables are written, and remove `work`;
-        `state` is that of the beginning, so that a recording that has changed meanwhile is
-        processed again."""
+        """Mark a recording, whose tables are written, as processed, and remove `work`; `state` is
+        that of the beginning, so that a recording that has changed meanwhile is processed again."""
         replace_text(self.path / _DONE / f'{recording_key(recording)}.json',
                      json.dumps({**summary, 'state': state}, indent=1) + '\n')
         _remove(work)
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Write the table `recordings` atomically."""
-        with TableWriter(self.path / 'recordings.parquet', TABLES['recordings']) as table:
+        path = self.path / 'recordings.parquet'
+        with parquet_table.TableWriter(path, TABLES['recordings']) as table:
             for row in rows:
                 table.add(row)
 
     def summaries(self, report: Callable[[str], object]) -> Iterator[dict[str, Any]]:
-        """Summaries of all processed recordings of all runs; damaged ones are reported and left
-        out."""
+        """Summaries of all processed recordings; damaged ones are reported and left out."""
         for path in sorted((self.path / _DONE).glob('*.json')):
             try:
                 yield _read_summary(path)
@@ -282,10 +271,10 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
 
     Each of `shifts` is added to the column `track_id` of its part (chronological).
     """
-    pa = import_pyarrow()
+    pa = parquet_table.import_pyarrow()
     n, day_ns = 0, pa.scalar(86_400 * NS)
     with ExitStack() as files:
-        days: dict[int, TableWriter] = {}
+        days: dict[int, parquet_table.TableWriter] = {}
         for path, shift in zip(parts, shifts, strict=True):
             rows = pa.parquet.read_table(path)
             n += len(rows)
@@ -297,7 +286,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
             for day in sorted(pa.compute.unique(days_of_rows).to_pylist()):
                 if day not in days:
                     date = datetime.date(1970, 1, 1) + datetime.timedelta(days=day)
-                    days[day] = files.enter_context(TableWriter(
+                    days[day] = files.enter_context(parquet_table.TableWriter(
                         folder / table / f'date={date}' / f'{name}.parquet', TABLES[table]))
                 days[day].add_table(rows.filter(pa.compute.equal(days_of_rows, day)))
     return n
@@ -312,7 +301,7 @@ def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
 def _read_summary(path: Path) -> dict[str, Any]:
     summary = _read_json(path)
     try:
-        check_row(summary, TABLES['recordings'])
+        parquet_table.check_row(summary, TABLES['recordings'])
         if summary['size'] is None:
             raise ValueError('size is missing')
     except ValueError as error:

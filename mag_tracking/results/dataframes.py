@@ -71,8 +71,7 @@ def _array(records: Sequence[Track | SmoothedPose | Detection], fields: Mapping[
 
 
 def dataframe(columns: Iterable[Column], values: Mapping[str, Any]) -> 'pd.DataFrame':
-    """Create a DataFrame from values (n,) by column; raises MissingDependencyError without
-    pandas."""
+    """Create a DataFrame of values (n,) by column; raises MissingDependencyError without pandas."""
     try:
         import pandas as pd
     except ModuleNotFoundError as error:

@@ -3,6 +3,7 @@
 import csv
 import math
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from os import PathLike
 from typing import Any
 
@@ -74,7 +75,7 @@ def pass_rows(fitted_pass: FittedPass) -> list[dict[str, Any]]:
              'chosen': int(fit is chosen), **delay} for fit in fitted_pass.fits]
 
 
-class FitFolder:
+class FitFolder(AbstractContextManager['FitFolder']):
     """Writes `fits.csv` continuously, and on exit, even after an error, `fits.json` with the
     entries of `summary`; a context manager."""
 
@@ -88,9 +89,6 @@ class FitFolder:
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
         self._writer = csv.writer(self._stream)
         self._writer.writerow(_NAMES)
-
-    def __enter__(self) -> 'FitFolder':
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._stream.close()
@@ -106,7 +104,6 @@ class FitFolder:
 
 
 def _bearing(bearing: Bearing | None) -> dict[str, Any] | None:
-    """Convert a `Bearing` to a dict for JSON; return None if there is no bearing."""
     if bearing is None:
         return None
     return {'to_closest_point': bearing.cpa_direction.tolist(),

@@ -6,7 +6,7 @@ pyarrow is imported when a table is written or read.
 import math
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 3
-"""Version of the tables. Folders of other versions are rejected, because their rows would not be
-comparable."""
+"""Version of the tables. Folders of other versions are rejected: rows are not comparable."""
 
 MAX_BUFFERED_ROWS = 5000
 
@@ -66,7 +65,7 @@ def is_complete(path: Path) -> bool:
         return begin == stream.read() == _MAGIC and stream.tell() > 2 * len(_MAGIC)
 
 
-class TableWriter:
+class TableWriter(AbstractContextManager['TableWriter']):
     """Writer of a Parquet file, in batches of rows; a context manager.
 
     An existing file is replaced only on success; after an error, none is created.
@@ -87,7 +86,6 @@ class TableWriter:
 
     @contextmanager
     def _convert_errors(self) -> Iterator[None]:
-        """Convert an OSError to an OutputError that names the file."""
         try:
             yield
         except OSError as error:
@@ -112,9 +110,6 @@ class TableWriter:
             with self._convert_errors():
                 self._writer.write_table(
                     import_pyarrow().Table.from_pylist(rows, self._schema))
-
-    def __enter__(self) -> 'TableWriter':
-        return self
 
     def __exit__(self, kind: object, *_: object) -> None:
         try:

@@ -3,7 +3,7 @@
 import csv
 import re
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from os import PathLike
 from typing import Any
 
@@ -21,7 +21,6 @@ from mag_tracking.results.columns import RESULT_TABLES, names_of, row_of
 from mag_tracking.results.track_files import RERUN_FILE, TrackRecording
 
 REPORT = 'report.html'
-"""File name of the report in a result folder."""
 _QUOTE, _SPECIAL = '"', {'"', ',', '\r', '\n'}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
 _RESULTS = (*RESULT_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', REPORT, RERUN_FILE)
@@ -33,7 +32,7 @@ def figure_name(kind: str, track_id: int) -> str:
     return f'{kind}_track_{track_id}.png'
 
 
-class ResultFolder(RecordReceiver):
+class ResultFolder(RecordReceiver, AbstractContextManager['ResultFolder']):
     """Writes the tables and the recording of one run; a context manager.
 
     Rows are written immediately, so that an interrupted run does not lose them. Results of an
@@ -44,20 +43,17 @@ class ResultFolder(RecordReceiver):
     def __init__(self, folder: str | PathLike[str], network: SensorNetwork) -> None:
         self.folder = output_folder(folder)
         check_no_other_recording(self.folder / _RECORDING)
-        self._files = ExitStack()
-        try:
-            self.replaces_earlier = self._remove_earlier_results()
-            self._streams = {name: self._files.enter_context(
-                new_text_file(self.folder / name, newline='')) for name in RESULT_TABLES}
-            for name, columns in RESULT_TABLES.items():
-                csv.writer(self._streams[name]).writerow(names_of(columns))
-            self._recording = TrackRecording(self.folder / _RECORDING, network)
-        except OutputError:
-            self._files.close()
-            raise
-        except OSError as error:
-            self._files.close()
-            raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
+        with ExitStack() as files:
+            try:
+                self.replaces_earlier = self._remove_earlier_results()
+                self._streams = {name: files.enter_context(
+                    new_text_file(self.folder / name, newline='')) for name in RESULT_TABLES}
+                for name, columns in RESULT_TABLES.items():
+                    csv.writer(self._streams[name]).writerow(names_of(columns))
+                self._recording = TrackRecording(self.folder / _RECORDING, network)
+            except OSError as error:
+                raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
+            self._files = files.pop_all()
 
     def _remove_earlier_results(self) -> bool:
         """Remove the results of an earlier run; return whether there were any."""
@@ -74,9 +70,6 @@ class ResultFolder(RecordReceiver):
         csv.writer(self._streams[name]).writerow([
             int(v) if isinstance(v, bool) else v
             for v in row_of(RESULT_TABLES[name], record).values()])
-
-    def __enter__(self) -> 'ResultFolder':
-        return self
 
     def __exit__(self, *_: object) -> None:
         # Closing a file fails on a full disk. All other files must still be closed.

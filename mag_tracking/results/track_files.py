@@ -18,36 +18,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import MissingDependencyError, OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_binary_file, replace_text
-from mag_tracking.messages.schema import (
-    disturbance_dict,
-    header_dict,
-    magnetic_field_dicts,
-    odometry_dict,
-    pose_dict,
-    pose_message_dict,
-    smoothed_track_dict,
-    track_dict,
-)
-from mag_tracking.messages.standard import (
-    delete_markers,
-    ellipsoid_axes,
-    sensor_markers,
-    sensor_transform_dicts,
-    track_markers,
-    track_transform_dict,
-)
-from mag_tracking.messages.types import (
-    DISTURBANCE,
-    MAGNETIC_FIELD,
-    MARKERS,
-    ODOMETRY,
-    PATH,
-    POSE_WITH_COVARIANCE,
-    SMOOTHED_TRACK,
-    TRACK_ARRAY,
-    TRANSFORMS,
-    MessageDict,
-)
+from mag_tracking.messages import schema, standard, types
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
@@ -112,7 +83,7 @@ def _write_track(rerun: Any, stream: Any, network: SensorNetwork, log: TrackLog)
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):
         stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))
-        std, orientation = ellipsoid_axes(log.covariance[k][:3, :3])
+        std, orientation = standard.ellipsoid_axes(log.covariance[k][:3, :3])
         stream.log(f'{root}/region', rerun.Ellipsoids3D(
             centers=[log.position[k]], half_sizes=[SCALE_3D * std],
             quaternions=[rerun.Quaternion(xyzw=orientation)]))
@@ -139,7 +110,7 @@ class TrackRecording:
         self._network, self._frame = network, network.frame
         self._topics = {name: f'{topic}_calibrated' for name, topic in zip(
             network.names, network.absolute_topics, strict=True)}
-        self._path: list[MessageDict] = []
+        self._path: list[types.MessageDict] = []
         self._smoothed: list[SmoothedPose] = []
         self._has_sensors = False
 
@@ -153,10 +124,10 @@ class TrackRecording:
         if self._has_sensors:
             return
         self._has_sensors = True
-        self._writer.write('/tf_static', TRANSFORMS, {'transforms': sensor_transform_dicts(
-            self._network, stamp_ns)}, stamp_ns)
-        self._writer.write('/tracker_node/sensor_markers', MARKERS,
-                           sensor_markers(self._network), stamp_ns)
+        transforms = standard.sensor_transform_dicts(self._network, stamp_ns)
+        self._writer.write('/tf_static', types.TRANSFORMS, {'transforms': transforms}, stamp_ns)
+        self._writer.write('/tracker_node/sensor_markers', types.MARKERS,
+                           standard.sensor_markers(self._network), stamp_ns)
 
     def add_frame(self, frame: FieldFrame) -> None:
         """Write the calibrated field of each sensor in a frame."""
@@ -166,34 +137,38 @@ class TrackRecording:
             if frame.n_samples[j]:
                 stamp_ns = frame.stamp_ns + round(1e9 * frame.time_offset[j])
                 readings = Readings.single(name, stamp_ns, frame.field[j], frame.covariance[j])
-                ((_, content),) = magnetic_field_dicts(readings)
-                self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
+                ((_, content),) = schema.magnetic_field_dicts(readings)
+                self._writer.write(self._topics[name], types.MAGNETIC_FIELD, content,
+                                   frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
         """Write a record of a track to its topics; at the end of the track, write its path."""
         self._write_smoothed()
         self._write_sensors(track.stamp_ns)
         stamp_ns, frame = track.stamp_ns, self._frame
-        content = track_dict(track, frame)
-        self._write('tracks', TRACK_ARRAY, {'header': content['header'], 'tracks': [content]},
+        content = schema.track_dict(track, frame)
+        self._write('tracks', types.TRACK_ARRAY, {'header': content['header'], 'tracks': [content]},
                     stamp_ns)
         if track.ended:
-            self._write('markers', MARKERS, delete_markers(track, frame), stamp_ns)
+            self._write('markers', types.MARKERS, standard.delete_markers(track, frame), stamp_ns)
             if self._path:
-                self._write('path', PATH, {'header': header_dict(stamp_ns, frame),
-                                           'poses': self._path}, stamp_ns)
+                self._write('path', types.PATH, {'header': schema.header_dict(stamp_ns, frame),
+                                                 'poses': self._path}, stamp_ns)
             self._path = []
             return
         child_frame = f'track_{track.id}'
+        pose = schema.pose_message_dict(track, frame)
+        odometry = schema.odometry_dict(track, frame, child_frame)
+        transform = standard.track_transform_dict(track, frame, child_frame)
         for topic, kind, message in (
-                ('/tracker_node/pose', POSE_WITH_COVARIANCE, pose_message_dict(track, frame)),
-                ('/tracker_node/odometry', ODOMETRY, odometry_dict(track, frame, child_frame)),
-                ('/tf', TRANSFORMS, track_transform_dict(track, frame, child_frame))):
+                ('/tracker_node/pose', types.POSE_WITH_COVARIANCE, pose),
+                ('/tracker_node/odometry', types.ODOMETRY, odometry),
+                ('/tf', types.TRANSFORMS, transform)):
             if message is not None:
                 self._writer.write(topic, kind, message, stamp_ns)
-        self._write('markers', MARKERS, track_markers(track, frame), stamp_ns)
+        self._write('markers', types.MARKERS, standard.track_markers(track, frame), stamp_ns)
         if track.topic_uncertainty is not None:
-            self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
+            self._path.append(schema.pose_dict(stamp_ns, frame, track.position, track.orientation))
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Buffer a smoothed pose; all smoothed poses of a track are written as a single message."""
@@ -206,16 +181,17 @@ class TrackRecording:
         if not poses:
             return
         self._smoothed, last_ns = [], poses[-1].stamp_ns
-        self._write('smoothed', SMOOTHED_TRACK, smoothed_track_dict(poses, self._frame), last_ns)
-        self._write('path_smoothed', PATH, {
-            'header': header_dict(last_ns, self._frame),
-            'poses': [pose_dict(p.stamp_ns, self._frame, p.position, p.orientation)
+        content = schema.smoothed_track_dict(poses, self._frame)
+        self._write('smoothed', types.SMOOTHED_TRACK, content, last_ns)
+        self._write('path_smoothed', types.PATH, {
+            'header': schema.header_dict(last_ns, self._frame),
+            'poses': [schema.pose_dict(p.stamp_ns, self._frame, p.position, p.orientation)
                       for p in poses]}, last_ns)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
         """Write a record of a disturbance: its detection or its end."""
-        self._write('disturbances', DISTURBANCE, disturbance_dict(disturbance, self._frame),
-                    disturbance.stamp_ns)
+        content = schema.disturbance_dict(disturbance, self._frame)
+        self._write('disturbances', types.DISTURBANCE, content, disturbance.stamp_ns)
 
-    def _write(self, name: str, kind: str, content: MessageDict, stamp_ns: int) -> None:
+    def _write(self, name: str, kind: str, content: types.MessageDict, stamp_ns: int) -> None:
         self._writer.write(f'/tracker_node/{name}', kind, content, stamp_ns)

@@ -34,12 +34,7 @@ FLEET_VERSION = 1
 def event_row(event: PassEvent) -> list[object]:
     """Cells of an event by column; numbers with a unit have six significant digits."""
     row = row_of(EVENTS, event)
-    return [_number(row[c.name]) if c.kind == 'f' and c.unit else row[c.name] for c in EVENTS]
-
-
-def _number(value: float) -> str:
-    """Format a number with six significant digits; return '' for NaN and infinity."""
-    return f'{value:.6g}' if np.isfinite(value) else ''
+    return [_cell(row[c.name], 6) if c.kind == 'f' and c.unit else row[c.name] for c in EVENTS]
 
 
 def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> None:
@@ -54,17 +49,14 @@ def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> No
 
 
 def _signature_rows(event: PassEvent) -> Iterator[list[object]]:
-    """Cells of the samples of an event's signature."""
     offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
                                                len(event.signature))
     closest_s = (event.closest_ns - event.onset_ns) / NS
     for t, field in zip(offsets_s, event.signature, strict=True):
-        yield [event.sensor, event.number, _number(closest_s + t),
-               *(_number(1e9 * v) for v in field)]
+        yield [event.sensor, event.number, *(_cell(v, 6) for v in (closest_s + t, *(1e9 * field)))]
 
 
 def _write_csv(path: Path, columns: Iterable[Column], rows: Iterable[Iterable[object]]) -> None:
-    """Write a CSV file with the names of the columns; raises OSError."""
     with new_text_file(path, newline='') as stream:
         writer = csv.writer(stream)
         writer.writerow(names_of(columns))
@@ -141,7 +133,7 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
     try:
         for name, columns in tables.items():
             _write_csv(folder / f'{name}.csv', columns, (
-                [_csv_value(row.get(c.name, '')) for c in columns] for row in rows[name]))
+                [_cell(row.get(c.name, ''), 9) for c in columns] for row in rows[name]))
             parquet = folder / f'{name}.parquet'
             if find_spec('pyarrow') is None:
                 parquet.unlink(missing_ok=True)
@@ -153,8 +145,8 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
         raise OutputError(f'cannot write to {folder}: {error.strerror or error}') from error
 
 
-def _csv_value(value: object) -> object:
+def _cell(value: object, digits: int) -> object:
     """Format a value as a cell of a CSV file; a number that is not finite becomes an empty cell."""
     if isinstance(value, float):
-        return f'{value:.9g}' if np.isfinite(value) else ''
+        return f'{value:.{digits}g}' if np.isfinite(value) else ''
     return value

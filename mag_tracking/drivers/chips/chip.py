@@ -24,7 +24,6 @@ class ChipLocation(NamedTuple):
     """Location of a chip on a bus."""
 
     address: int
-    """Address of the chip."""
     multiplexer: int | None = None
     """Address of the TCA9548A multiplexer; None if the chip is directly on the bus."""
     channel: int | None = None
@@ -115,8 +114,7 @@ class Conversion(NamedTuple):
     middle_ns: int
     """Estimated `time.monotonic_ns()` at the middle of the conversion."""
     field: Axes
-    """[T] Field in the right-handed axes described by the chip's module; NaN for an axis that
-    exceeds its range."""
+    """[T] Field in the axes described by the chip's module; NaN for an axis over its range."""
 
 
 Measurement: TypeAlias = Generator[float, None, Conversion | None]
@@ -126,8 +124,7 @@ Measurement: TypeAlias = Generator[float, None, Conversion | None]
 class Chip:
     """Magnetometer chip.
 
-    Creating an instance does not access the bus. `count` is called for each loss, with the cause as
-    a plural noun phrase.
+    Creating one does not access the bus. `count` is called with the plural cause of each loss.
     """
 
     NAME = ''

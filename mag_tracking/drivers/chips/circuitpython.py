@@ -30,27 +30,17 @@ from mag_tracking.errors import DeviceError
 TIMEOUT_NS = 250_000_000
 """[ns] Timeout of one measurement. Creating the driver instance may take ten times as long."""
 UNITS = {
-    'adafruit_bno055.BNO055_I2C': 'uT',
-    'adafruit_bno08x.i2c.BNO08X_I2C': 'uT',
-    'adafruit_fxos8700.FXOS8700': 'uT',
-    'adafruit_icm20x.ICM20948': 'uT',
-    'adafruit_lis2mdl.LIS2MDL': 'uT',
-    'adafruit_lis3mdl.LIS3MDL': 'uT',
-    'adafruit_lsm303agr_mag.LSM303AGR_Mag': 'uT',
-    'adafruit_lsm303dlh_mag.LSM303DLH_Mag': 'uT',
-    'adafruit_lsm9ds0.LSM9DS0_I2C': 'G',
-    'adafruit_lsm9ds1.LSM9DS1_I2C': 'G',
-    'adafruit_mlx90393.MLX90393': 'uT',
-    'adafruit_mlx90395.MLX90395': 'uT',
-    'adafruit_mmc56x3.MMC5603': 'uT',
-    'adafruit_qmc5883p.QMC5883P': 'G',
-    'adafruit_tlv493d.TLV493D': 'uT',
-    'adafruit_tmag5273.TMAG5273': 'uT',
-    'qmc5883l.QMC5883L': 'G',
+    'adafruit_bno055.BNO055_I2C': 'uT', 'adafruit_bno08x.i2c.BNO08X_I2C': 'uT',
+    'adafruit_fxos8700.FXOS8700': 'uT', 'adafruit_icm20x.ICM20948': 'uT',
+    'adafruit_lis2mdl.LIS2MDL': 'uT', 'adafruit_lis3mdl.LIS3MDL': 'uT',
+    'adafruit_lsm303agr_mag.LSM303AGR_Mag': 'uT', 'adafruit_lsm303dlh_mag.LSM303DLH_Mag': 'uT',
+    'adafruit_lsm9ds0.LSM9DS0_I2C': 'G', 'adafruit_lsm9ds1.LSM9DS1_I2C': 'G',
+    'adafruit_mlx90393.MLX90393': 'uT', 'adafruit_mlx90395.MLX90395': 'uT',
+    'adafruit_mmc56x3.MMC5603': 'uT', 'adafruit_qmc5883p.QMC5883P': 'G',
+    'adafruit_tlv493d.TLV493D': 'uT', 'adafruit_tmag5273.TMAG5273': 'uT', 'qmc5883l.QMC5883L': 'G',
     'rm3100.RM3100_I2C': 'uT'}
 """{module.Class: unit of its field}."""
 PROPERTIES = ('magnetic', 'magnetometer')
-"""Names of the property that reads the field."""
 REPORTS = {'adafruit_bno08x.i2c.BNO08X_I2C': 0x03}
 """{module.Class: number of the report of the field, which is disabled after a reset}."""
 
@@ -108,13 +98,11 @@ class BusioI2c:
         in_buffer[in_start:in_end] = bytes(message)
 
     def _transfer(self, *messages: i2c_msg) -> None:
-        """Make one transaction."""
         self._check_deadline()
         self.addresses.update(message.addr for message in messages)
         self._registers.transfer(*messages)
 
     def _check_deadline(self) -> None:
-        """Raise DeviceError if the deadline has passed."""
         if self._registers.monotonic_ns() > self._deadline_ns:
             raise DeviceError('timeout while the driver waited for its chip')
 
@@ -152,12 +140,10 @@ class CircuitpythonChip(Chip):
                               'correct the address')
 
     def _property_name(self) -> str:
-        """Name of the property that reads the field."""
         # A look at the property of the instance would start a measurement.
         members = {*dir(type(self._driver)), *getattr(self._driver, '__dict__', ())}
-        for name in PROPERTIES:
-            if name in members:
-                return name
+        if found := [name for name in PROPERTIES if name in members]:
+            return found[0]
         raise DeviceError(f'the class has none of the properties {", ".join(PROPERTIES)}')
 
     def _enable_report(self, report: int) -> None:
@@ -184,7 +170,6 @@ class CircuitpythonChip(Chip):
 
 
 def _address_argument(cls: Any, address: int) -> dict[str, int]:
-    """Return {parameter named after the address: address}; empty if `cls` has none."""
     names = list(inspect.signature(cls).parameters)[1:]
     candidates = ['address'] * ('address' in names) + [name for name in names if 'addr' in name]
     return dict.fromkeys(candidates[:1], address)

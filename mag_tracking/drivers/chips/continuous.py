@@ -23,15 +23,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import (
-    CONVERSION_MARGIN,
-    Chip,
-    Conversion,
-    Measurement,
-    Registers,
-    look_up_choice,
-    mask_overrange,
-)
+from mag_tracking.drivers.chips import chip
 from mag_tracking.settings import param
 
 
@@ -43,7 +35,7 @@ class Lis3mdlSettings:
         400.0, 'Measurement range of an axis: 400, 800, 1200 or 1600.', 'uT', (400.0, 1600.0))
 
 
-class Lis3mdl(Chip):
+class Lis3mdl(chip.Chip):
     """LIS3MDL magnetometer; the module describes its timing, axes and scale."""
 
     NAME = 'lis3mdl'
@@ -59,10 +51,10 @@ class Lis3mdl(Chip):
                    1600.0: (0x60, 1711)}
     """{full scale [µT]: (bits of control register 2, counts per gauss)}."""
 
-    def __init__(self, registers: Registers, settings: Lis3mdlSettings,
+    def __init__(self, registers: chip.Registers, settings: Lis3mdlSettings,
                  count: Callable[[str], None]) -> None:
         super().__init__(registers, settings, count)
-        self._scale_bits, self._gain = look_up_choice(
+        self._scale_bits, self._gain = chip.look_up_choice(
             'lis3mdl.range_ut', settings.range_ut, self.FULL_SCALES)
         self._max_field = settings.range_ut * 1e-6
 
@@ -75,9 +67,9 @@ class Lis3mdl(Chip):
         self._registers.write(self.CONTROL_1 + 3, self.ULTRA_Z)
         self._registers.write(self.CONTROL_1 + 4, self.BLOCK_DATA_UPDATE)
         self._registers.write(self.CONTROL_1 + 2, self.CONTINUOUS)
-        self._registers.sleep(self.PERIOD_NS * 1e-9 * CONVERSION_MARGIN)
+        self._registers.sleep(self.PERIOD_NS * 1e-9 * chip.CONVERSION_MARGIN)
 
-    def measure(self) -> Measurement:
+    def measure(self) -> chip.Measurement:
         """Read the latest conversion, None if it is not new; nothing is yielded."""
         yield from ()
         now_ns = self._registers.monotonic_ns()
@@ -87,7 +79,7 @@ class Lis3mdl(Chip):
         if status & self.OVERRUN:
             self._count('conversions overwritten before they were read')
         block = self._registers.read_block(self.OUT | self.AUTO_INCREMENT, 6)
-        return Conversion(now_ns - self.PERIOD_NS, mask_overrange(
+        return chip.Conversion(now_ns - self.PERIOD_NS, chip.mask_overrange(
             [c / self._gain * 1e-4 for c in struct.unpack('<hhh', block)], self._max_field))
 
 
@@ -100,7 +92,7 @@ class Rm3100Settings:
         'finer resolution at a lower rate.', '', (50, 200))
 
 
-class Rm3100(Chip):
+class Rm3100(chip.Chip):
     """RM3100 magnetometer; the module describes its timing, axes and scale."""
 
     NAME = 'rm3100'
@@ -115,11 +107,11 @@ class Rm3100(Chip):
     CYCLES = {50: (20.0, 534.0), 100: (38.0, 283.0), 200: (75.0, 147.0)}
     """{cycle count: (counts per microtesla, measurements of all axes per second)}."""
 
-    def __init__(self, registers: Registers, settings: Rm3100Settings,
+    def __init__(self, registers: chip.Registers, settings: Rm3100Settings,
                  count: Callable[[str], None]) -> None:
         super().__init__(registers, settings, count)
         self._cycles = settings.cycle_count
-        self._gain, rate_hz = look_up_choice('rm3100.cycle_count', self._cycles, self.CYCLES)
+        self._gain, rate_hz = chip.look_up_choice('rm3100.cycle_count', self._cycles, self.CYCLES)
         self._delay_ns = round(1e9 / rate_hz)
 
     def set_up(self) -> None:
@@ -131,9 +123,9 @@ class Rm3100(Chip):
             self._registers.write(self.CYCLE_COUNTS + 2 * axis + 1, self._cycles & 0xFF)
         self._registers.write(self.RATE, self.FASTEST_RATE)
         self._registers.write(self.CONTINUOUS, self.ALL_AXES_READY)
-        self._registers.sleep(self._delay_ns * 1e-9 * CONVERSION_MARGIN)
+        self._registers.sleep(self._delay_ns * 1e-9 * chip.CONVERSION_MARGIN)
 
-    def measure(self) -> Measurement:
+    def measure(self) -> chip.Measurement:
         """Read the latest conversion, None if it is not new; nothing is yielded."""
         yield from ()
         now_ns = self._registers.monotonic_ns()
@@ -141,5 +133,5 @@ class Rm3100(Chip):
             return None
         block = self._registers.read_block(self.RESULTS, 9)
         counts = (int.from_bytes(block[i:i + 3], 'big', signed=True) for i in (0, 3, 6))
-        return Conversion(now_ns - self._delay_ns, mask_overrange(
+        return chip.Conversion(now_ns - self._delay_ns, chip.mask_overrange(
             [c / self._gain * 1e-6 for c in counts], self.FULL_SCALE))

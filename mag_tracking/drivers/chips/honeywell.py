@@ -3,8 +3,7 @@
 Each reading starts a conversion. The timestamp is the middle of the conversion, 3 ms after the
 start, with an uncertainty of about 1 ms.
 
-Axes: as drawn in the data sheets, right-handed. The order of the registers is X, Z, Y. An axis over
-its range is NaN.
+Axes: as drawn in the data sheets, right-handed, in registers X, Z, Y; NaN over the range.
 
 Scale: 73, 92, 122, 152, 227, 256, 303, 435 nT per count for ranges of ±88, 130, 190, 250, 400, 470,
 560, 810 µT. The noise is about 200 nT. The offset may be tens of microtesla and drifts with
@@ -27,14 +26,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import (
-    CONVERSION_MARGIN,
-    Chip,
-    Conversion,
-    Measurement,
-    Registers,
-    look_up_choice,
-)
+from mag_tracking.drivers.chips import chip
 from mag_tracking.settings import param
 
 CONFIGURATION_A, CONFIGURATION_B, MODE = 0x00, 0x01, 0x02
@@ -55,19 +47,18 @@ class Hmc5883lSettings:
         (88.0, 810.0))
 
 
-class Hmc5883l(Chip):
+class Hmc5883l(chip.Chip):
     """HMC5883L magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x0A, ord('H')), (0x0B, ord('4')), (0x0C, ord('3')))
     NAME = 'hmc5883l'
     CONFIGURATION = 0x10
-    """Configuration register A: one sample per measurement, no bias. The rate of 15 Hz does not
-    affect single measurements."""
+    """Configuration register A: one sample per measurement, no bias; the rate has no effect."""
 
-    def __init__(self, registers: Registers, settings: Hmc5883lSettings,
+    def __init__(self, registers: chip.Registers, settings: Hmc5883lSettings,
                  count: Callable[[str], None]) -> None:
         super().__init__(registers, settings, count)
-        self._gain = look_up_choice(f'{self.NAME}.range_ut', settings.range_ut, GAINS)
+        self._gain = chip.look_up_choice(f'{self.NAME}.range_ut', settings.range_ut, GAINS)
         self._gain_bits = list(GAINS).index(settings.range_ut) << 5
 
     def set_up(self) -> None:
@@ -76,13 +67,13 @@ class Hmc5883l(Chip):
         self._registers.write(CONFIGURATION_B, self._gain_bits)
         # The first measurement after a change of the gain still uses the old gain.
         self._registers.write(MODE, SINGLE_MEASUREMENT)
-        self._registers.sleep(CONVERSION_S * CONVERSION_MARGIN)
+        self._registers.sleep(CONVERSION_S * chip.CONVERSION_MARGIN)
 
-    def measure(self) -> Measurement:
+    def measure(self) -> chip.Measurement:
         """Make a single measurement, None if it is not finished in time."""
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
-        yield CONVERSION_S * CONVERSION_MARGIN
+        yield CONVERSION_S * chip.CONVERSION_MARGIN
         configuration, gain_bits, mode, x, z, y = struct.unpack(
             '>BBBhhh', self._registers.read_block(CONFIGURATION_A, 9))
         if configuration != self.CONFIGURATION or gain_bits != self._gain_bits:
@@ -92,7 +83,7 @@ class Hmc5883l(Chip):
         if mode & 0x03 == SINGLE_MEASUREMENT:
             return None
         x, y, z = (math.nan if c == OVERFLOW else c / self._gain * 1e-4 for c in (x, y, z))
-        return Conversion(start_ns + round(CONVERSION_S * 1e9) // 2, (x, y, z))
+        return chip.Conversion(start_ns + round(CONVERSION_S * 1e9) // 2, (x, y, z))
 
 
 class Hmc5983(Hmc5883l):

@@ -29,15 +29,7 @@ import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
-from mag_tracking.drivers.chips.chip import (
-    CONVERSION_MARGIN,
-    Chip,
-    Conversion,
-    Measurement,
-    Registers,
-    look_up_choice,
-    mask_overrange,
-)
+from mag_tracking.drivers.chips import chip
 from mag_tracking.drivers.reading import Axes
 from mag_tracking.settings import param
 
@@ -68,7 +60,7 @@ class Mmc5603Settings(Mmc5983maSettings):
         'ms', (1.2, 6.6))
 
 
-class Mmc5983ma(Chip):
+class Mmc5983ma(chip.Chip):
     """MMC5983MA magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x2F, 0x30),)
@@ -80,11 +72,11 @@ class Mmc5983ma(Chip):
     """Maximum valid magnitude of a count; at larger magnitudes, the converter is saturated."""
     N_BYTES = 7
 
-    def __init__(self, registers: Registers, settings: Mmc5983maSettings,
+    def __init__(self, registers: chip.Registers, settings: Mmc5983maSettings,
                  count: Callable[[str], None]) -> None:
         super().__init__(registers, settings, count)
-        self._bandwidth = look_up_choice(f'{self.NAME}.conversion_ms', settings.conversion_ms,
-                                         self.BANDWIDTHS)
+        self._bandwidth = chip.look_up_choice(f'{self.NAME}.conversion_ms', settings.conversion_ms,
+                                              self.BANDWIDTHS)
         self._conversion_ns = round(settings.conversion_ms * 1e6)
         self._set_reset_ns = round(settings.set_reset_s * 1e9)
         self._offset: Axes | None = None
@@ -96,7 +88,7 @@ class Mmc5983ma(Chip):
         self._registers.sleep(self.SOFT_RESET_S)
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
-    def measure(self) -> Measurement:
+    def measure(self) -> chip.Measurement:
         """Make one measurement if the stored offset is recent, otherwise a SET/RESET pair."""
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):
@@ -108,8 +100,7 @@ class Mmc5983ma(Chip):
         x, y, z = (c - o for c, o in zip(counts, self._offset, strict=True))
         return _conversion(middle_ns, (x, y, z))
 
-    def _measure_pair(self) -> Measurement:
-        """Measure after SET and after RESET, and store the offset."""
+    def _measure_pair(self) -> chip.Measurement:
         conversions = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
@@ -130,11 +121,11 @@ class Mmc5983ma(Chip):
         """Make one conversion; return (middle [ns], counts), or None if not finished in time."""
         self._registers.write(self.CONTROL_0, TAKE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
-        yield self._conversion_ns * 1e-9 * CONVERSION_MARGIN
+        yield self._conversion_ns * 1e-9 * chip.CONVERSION_MARGIN
         if not self._registers.read(self.STATUS) & self.DONE:
             return None
         counts = self._counts(self._registers.read_block(0x00, self.N_BYTES))
-        return start_ns + self._conversion_ns // 2, mask_overrange(counts, self.FULL_SCALE)
+        return start_ns + self._conversion_ns // 2, chip.mask_overrange(counts, self.FULL_SCALE)
 
     @staticmethod
     def _counts(block: bytes) -> list[int]:
@@ -161,7 +152,6 @@ class Mmc5603(Mmc5983ma):
                 for i in range(3)]
 
 
-def _conversion(middle_ns: int, counts: Axes) -> Conversion:
-    """Create a conversion from the time of its middle [ns] and its field [counts]."""
+def _conversion(middle_ns: int, counts: Axes) -> chip.Conversion:
     x, y, z = (c / COUNTS_PER_TESLA for c in counts)
-    return Conversion(middle_ns, (x, y, z))
+    return chip.Conversion(middle_ns, (x, y, z))

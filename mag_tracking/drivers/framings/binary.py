@@ -8,33 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
-from mag_tracking.drivers.framings.fields import (
-    AXES,
-    SKIP,
-    FieldLayout,
-    Rejected,
-    axis_value,
-    check_choice,
-    ignore_value,
-    ticks_value,
-)
+from mag_tracking.drivers.framings import fields
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
-
-
-class Checksum(NamedTuple):
-    """Checksum algorithm.
-
-    Source of the names and polynomials: "Catalogue of parametrised CRC algorithms" (G. Cook).
-    """
-
-    size: int
-    """Length in bytes."""
-    compute: Callable[[bytes], int]
-    """Function that computes the checksum of the covered bytes."""
 
 
 def xor8(data: bytes) -> int:
@@ -70,16 +49,17 @@ def crc16_modbus(data: bytes) -> int:
     return crc
 
 
-CHECKSUMS = {
-    'sum8': Checksum(1, lambda data: sum(data) & 0xFF),
-    'xor8': Checksum(1, xor8),
-    'crc8': Checksum(1, crc8),
+CHECKSUMS: dict[str, tuple[int, Callable[[bytes], int]]] = {
+    'sum8': (1, lambda data: sum(data) & 0xFF),
+    'xor8': (1, xor8),
+    'crc8': (1, crc8),
     # CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021.
-    'crc16_ccitt': Checksum(2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
-    'crc16_modbus': Checksum(2, crc16_modbus),
+    'crc16_ccitt': (2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
+    'crc16_modbus': (2, crc16_modbus),
     # CRC-32 (ISO-HDLC), as in Ethernet and zip.
-    'crc32': Checksum(4, zlib.crc32)}
-"""Checksums by their names in the settings."""
+    'crc32': (4, zlib.crc32)}
+"""Length in bytes and function, by the names in the settings, which are those of the "Catalogue of
+parametrised CRC algorithms" (G. Cook), also the source of the polynomials."""
 _STRUCT_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
                  'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
 _ByteOrder: TypeAlias = Literal['little', 'big']
@@ -116,8 +96,7 @@ class BinaryFraming:
     or in a payload begins a false frame, which is accepted with probability 2^-n and hides the true
     frames that begin within it. Without a checksum, every sync is accepted; a tail is a weak
     checksum. True frames are then found if they follow each other without a gap, or if the gap
-    contains no sync. After any other gap, readings may be false or lost until the search is aligned
-    again.
+    contains no sync. After any other gap, readings may be false or lost until it is aligned again.
     """
 
     SETTINGS = BinarySettings
@@ -127,25 +106,26 @@ class BinaryFraming:
         if not self._sync:
             raise SettingsError('sync: at least one byte is required, such as A5')
         self._tail = _parse_bytes('tail', settings.tail)
-        self._order: _ByteOrder = check_choice('byte_order', settings.byte_order, ('little', 'big'))
-        name = check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
-        self._checksum = CHECKSUMS.get(name, Checksum(0, lambda data: 0))
-        first_part = check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
-        fields, each = (_parse_fields('fields', settings.fields),
-                        _parse_fields('each', settings.each))
-        self._layout = FieldLayout([name for name, _ in fields], [name for name, _ in each],
-                                   settings.count)
-        types = [kind for _, kind in fields + each * settings.count]
+        self._order: _ByteOrder = fields.check_choice(
+            'byte_order', settings.byte_order, ('little', 'big'))
+        name = fields.check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
+        checksum_size, self._compute = CHECKSUMS.get(name, (0, lambda data: 0))
+        first = fields.check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
+        frame, each = (_parse_fields('fields', settings.fields),
+                       _parse_fields('each', settings.each))
+        self._layout = fields.FieldLayout([name for name, _ in frame], [name for name, _ in each],
+                                          settings.count)
+        types = [kind for _, kind in frame + each * settings.count]
         self._struct = struct.Struct(
             '<>'[self._order == 'big'] + ''.join(_STRUCT_CODES[kind] for kind in types))
         self._converters = [_converter(quantity, kind, self._order) for quantity, kind
                             in zip(self._layout.quantities, types, strict=True)]
         self._payload_start = len(self._sync)
-        self._coverage_start = 0 if first_part == 'sync' else self._payload_start
+        self._coverage_start = 0 if first == 'sync' else self._payload_start
         self._payload_end = self._payload_start + self._struct.size
-        self._checksum_end = self._payload_end + self._checksum.size
+        self._checksum_end = self._payload_end + checksum_size
         self.size = self._checksum_end + len(self._tail)
-        kinds = dict(fields)
+        kinds = dict(frame)
         self.CLOCK: dict[str, float] = {'wrap': _wrap(kinds['ticks'])} if 'ticks' in kinds else {}
         self.DRIVER: dict[str, int] = (
             {'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
@@ -167,7 +147,7 @@ class BinaryFraming:
             if not cause:
                 try:
                     readings += self._read(data, start)
-                except Rejected as error:
+                except fields.Rejected as error:
                     cause = str(error)
             if cause:
                 rejected[f'frames {cause}'] += 1
@@ -182,10 +162,8 @@ class BinaryFraming:
 
     def _partial_sync(self, data: bytes, at: int) -> int:
         """Length of the partial sync at the end of `data[at:]`; 0 without a partial sync."""
-        for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
-            if data.endswith(self._sync[:n]):
-                return n
-        return 0
+        return next((n for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1)
+                     if data.endswith(self._sync[:n])), 0)
 
     def _rejection_cause(self, data: bytes, start: int) -> str:
         """Reason why the frame at `start` is rejected; empty for a valid frame."""
@@ -194,19 +172,17 @@ class BinaryFraming:
             return 'with a wrong tail'
         end = start + self._payload_end
         sent_checksum = int.from_bytes(data[end:start + self._checksum_end], self._order)
-        if sent_checksum != self._checksum.compute(data[start + self._coverage_start:end]):
+        if sent_checksum != self._compute(data[start + self._coverage_start:end]):
             return 'with a wrong checksum'
         return ''
 
     def _read(self, data: bytes, start: int) -> list[Reading]:
-        """Extract the readings of the frame at `start`; raises Rejected for an invalid value."""
         values = self._struct.unpack_from(data, start + self._payload_start)
         return self._layout.readings(
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
 
 def _parse_bytes(setting: str, text: str) -> bytes:
-    """Parse hexadecimal bytes."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -214,10 +190,9 @@ def _parse_bytes(setting: str, text: str) -> bytes:
             f'{setting}: {text!r} is not hexadecimal; expected bytes such as A5 5A') from None
 
 
-def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse fields such as x:i16 into [(name, type)]."""
+def _parse_fields(setting: str, texts: Sequence[str]) -> list[tuple[str, str]]:
     out = []
-    for text in fields:
+    for text in texts:
         name, _, kind = text.rpartition(':')
         if kind not in _STRUCT_CODES:
             raise SettingsError(f'{setting}: {text!r}: expected a name with one of the types '
@@ -235,12 +210,12 @@ def _wrap(kind: str) -> int:
 
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
-    """Return the function that converts unpacked values of a quantity for `FieldLayout`."""
-    if quantity == SKIP:
-        return ignore_value
+    if quantity == fields.SKIP:
+        return fields.ignore_value
     convert: _Converter
-    if quantity in AXES or quantity == 'ticks':
-        convert = float if kind[0] != 'f' else axis_value if quantity in AXES else ticks_value
+    if quantity in fields.AXES or quantity == 'ticks':
+        checked = fields.axis_value if quantity in fields.AXES else fields.ticks_value
+        convert = checked if kind[0] == 'f' else float
     else:
         convert = str if quantity == 'sensor' else int
     if not kind.endswith('24'):

@@ -23,7 +23,6 @@ SKIP = '-'
 Values: TypeAlias = Sequence[Any]
 """Values of one frame; the type of each follows from its field."""
 MAX_NAME = 64
-"""Maximum length of a sensor's name in characters."""
 _ESCAPE_PATTERN = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
 _ESCAPED_CHARACTERS = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
 _Choice = TypeVar('_Choice', bound=str)
@@ -101,7 +100,6 @@ def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Val
 
 
 def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return `fields`, then `each` for every sensor."""
     for name in fields:
         quantity, sensor = _split(name)
         if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
@@ -121,7 +119,6 @@ def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple
 
 
 def _is_valid_name(name: str) -> bool:
-    """Whether a sensor may have this name."""
     return 0 < len(name) <= MAX_NAME and name.isprintable()
 
 
@@ -145,8 +142,7 @@ def ticks_value(value: float) -> float:
 
 
 def text_number(text: str, decimal: str) -> float:
-    """Convert a text, as in quotes, to float; raises ValueError unless it is decimal, nan or
-    inf."""
+    """Convert a text to float; raises ValueError unless it is decimal, nan or inf."""
     text = text.strip()
     if decimal == ',':
         text = text.replace(',', '.')
@@ -191,7 +187,6 @@ def sensor_name(text: str) -> str:
 
 def ignore_value(value: object) -> None:
     """Discard a skipped value."""
-    return None
 
 
 def decode_escapes(setting: str, text: str) -> bytes:

@@ -6,20 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from mag_tracking.drivers.framings.fields import (
-    ACCELERATION,
-    FIELD,
-    FRAME_QUANTITIES,
-    FieldLayout,
-    Rejected,
-    axis_value,
-    decimal_remedy,
-    sensor_name,
-    sequence_value,
-    text_number,
-    text_ticks,
-    ticks_value,
-)
+from mag_tracking.drivers.framings import fields
 from mag_tracking.drivers.framings.text import Lines
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
@@ -79,19 +66,19 @@ class JsonFraming:
         self._lists: list[tuple[str, _Keys]] = []
         self._values: list[tuple[str, _Keys, _Converter]] = []
         names: list[str] = []
-        for name in FRAME_QUANTITIES:
+        for name in fields.FRAME_QUANTITIES:
             if path := getattr(settings, name):
                 names.append(name)
                 self._values.append((path, _split_path(name, path), _CONVERTERS[name]))
-        for name, axes in (('field', FIELD), ('acceleration', ACCELERATION)):
+        for name, axes in (('field', fields.FIELD), ('acceleration', fields.ACCELERATION)):
             for axis, path in zip(axes, self._axis_paths(name, getattr(settings, name)),
                                   strict=True):
                 if path:
                     names.append(axis)
                     self._values.append((path, _split_path(name, path), _axis))
-        if not self._values or names[-1] in FRAME_QUANTITIES:
+        if not self._values or names[-1] in fields.FRAME_QUANTITIES:
             raise SettingsError('field: a path of the field or of the acceleration is required')
-        self._layout = FieldLayout(names)
+        self._layout = fields.FieldLayout(names)
 
     def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
         """Paths of the three axes of setting `name`; the path of a list is added to `_lists`."""
@@ -110,17 +97,15 @@ class JsonFraming:
         return self._lines.parse(data, final, self._read)
 
     def _is_single_document(self, data: bytes) -> bool:
-        """Whether `data` is a single JSON document that spans several lines."""
         if self._lines.end not in data.strip() or len(data) > self._lines.max_length:
             return False
         try:
             self._decode_document(data)
-        except Rejected:
+        except fields.Rejected:
             return False
         return True
 
     def _decode_document(self, line: bytes) -> Any:
-        """Decode a JSON document; raises Rejected if it is not valid."""
         try:
             text = line.decode()
             try:
@@ -131,31 +116,30 @@ class JsonFraming:
                     raise
                 return self._decode(_LOOSE.sub(_strict, text))
         except RecursionError:
-            raise Rejected('that are nested too deeply') from None
-        except Rejected:
+            raise fields.Rejected('that are nested too deeply') from None
+        except fields.Rejected:
             raise
         except ValueError as error:
             # This includes integers with more digits than Python converts.
-            raise Rejected('that are not JSON', f'{error}; lines of numbers have the framing '
-                           'text'[:200]) from None
+            remedy = f'{error}; lines of numbers have the framing text'[:200]
+            raise fields.Rejected('that are not JSON', remedy) from None
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Extract the reading of one object."""
         content = self._decode_document(line)
         if not isinstance(content, dict):
-            raise Rejected('that are not a JSON object',
-                           'send objects such as {"x": 1.0, "y": 2.0, "z": 3.0}')
+            raise fields.Rejected('that are not a JSON object',
+                                  'send objects such as {"x": 1.0, "y": 2.0, "z": 3.0}')
         for path, keys in self._lists:
             value = _lookup(content, path, keys)
             if not isinstance(value, list) or len(value) != 3:
-                raise Rejected(f'whose {path} is not a list of three values',
-                               'field needs the paths of x, y and z, or of a list of three values')
+                raise fields.Rejected(
+                    f'whose {path} is not a list of three values',
+                    'field needs the paths of x, y and z, or of a list of three values')
         return self._layout.readings([convert(_lookup(content, path, keys), path, self._decimal)
                                       for path, keys, convert in self._values])
 
 
 def _strict(match: re.Match[str]) -> str:
-    """Replace a match of `_LOOSE` by JSON."""
     string, quoted, key, constant = match.groups()
     if string:
         return string
@@ -165,10 +149,9 @@ def _strict(match: re.Match[str]) -> str:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Dict of a JSON object, whose keys must differ."""
     content = dict(pairs)
     if len(content) != len(pairs):
-        raise Rejected('with a duplicate key')
+        raise fields.Rejected('with a duplicate key')
     return content
 
 
@@ -181,7 +164,6 @@ def _split_path(name: str, path: str) -> _Keys:
 
 
 def _lookup(value: Any, path: str, keys: _Keys) -> Any:
-    """Value at a path."""
     content = value
     for key, index in keys:
         if isinstance(value, dict) and key in value:
@@ -189,7 +171,7 @@ def _lookup(value: Any, path: str, keys: _Keys) -> Any:
         elif isinstance(value, list) and index is not None and index < len(value):
             value = value[index]
         else:
-            raise Rejected(f'without {path}', f'the paths are {_paths(content)}'[:200])
+            raise fields.Rejected(f'without {path}', f'the paths are {_paths(content)}'[:200])
     return value
 
 
@@ -205,42 +187,40 @@ def _number(value: object, path: str, decimal: str) -> int | float:
     """Return a number, or the number in its quotes."""
     if isinstance(value, str):
         try:
-            return text_number(value, decimal)
+            return fields.text_number(value, decimal)
         except ValueError:
-            raise Rejected(f'whose {path} is not a number', decimal_remedy(value)) from None
+            raise fields.Rejected(f'whose {path} is not a number',
+                                  fields.decimal_remedy(value)) from None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise Rejected(f'whose {path} is not a number', f'it is of the type {type(value).__name__}')
+        raise fields.Rejected(f'whose {path} is not a number',
+                              f'it is of the type {type(value).__name__}')
     return value
 
 
 def _axis(value: object, path: str, decimal: str) -> float:
-    """Convert an axis to float, null to NaN."""
-    return float('nan') if value in (None, '') else axis_value(_number(value, path, decimal))
+    return float('nan') if value in (None, '') else fields.axis_value(_number(value, path, decimal))
 
 
 def _ticks(value: object, path: str, decimal: str) -> float:
-    """Convert a device time, a number or a date."""
-    return text_ticks(value, decimal) if isinstance(value, str) else ticks_value(
+    return fields.text_ticks(value, decimal) if isinstance(value, str) else fields.ticks_value(
         _number(value, path, decimal))
 
 
 def _sequence(value: object, path: str, decimal: str) -> int:
-    """Convert a sequence number, such as 12 or 12.0, to int."""
     value = _number(value, path, decimal)
     if isinstance(value, float):
         if not value.is_integer():
-            raise Rejected(f'whose {path} is not an integer')
+            raise fields.Rejected(f'whose {path} is not an integer')
         value = int(value)
-    return sequence_value(value)
+    return fields.sequence_value(value)
 
 
 def _sensor(value: object, path: str, decimal: str) -> str:
-    """Convert a name (string or integer) to str."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):
-        raise Rejected(f'whose {path} is not a name')
-    return sensor_name(value)
+        raise fields.Rejected(f'whose {path} is not a name')
+    return fields.sensor_name(value)
 
 
 _CONVERTERS: dict[str, _Converter] = {'sensor': _sensor, 'ticks': _ticks, 'sequence': _sequence}

@@ -6,22 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from mag_tracking.drivers.framings import fields
 from mag_tracking.drivers.framings.binary import xor8
-from mag_tracking.drivers.framings.fields import (
-    AXES,
-    SKIP,
-    FieldLayout,
-    Rejected,
-    axis_value,
-    check_choice,
-    decimal_remedy,
-    decode_escapes,
-    ignore_value,
-    sensor_name,
-    sequence_value,
-    text_ticks,
-    ticks_value,
-)
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
@@ -66,7 +52,7 @@ class Lines:
     """Splits bytes into lines of at most `max_length` bytes and counts invalid lines."""
 
     def __init__(self, end: str, max_length: int) -> None:
-        self.end = decode_escapes('end', end)
+        self.end = fields.decode_escapes('end', end)
         if not self.end:
             raise SettingsError('end: at least one character is required, such as \\n')
         self.max_length = max_length
@@ -91,7 +77,7 @@ class Lines:
         for line in lines:
             try:
                 readings += read(self._clean(line))
-            except Rejected as cause:
+            except fields.Rejected as cause:
                 rejected[f'lines {cause}'] += 1
                 if cause.remedy and f'lines {cause}' not in examples:
                     shown = line[:MAX_SHOWN].decode(errors='backslashreplace')
@@ -101,15 +87,15 @@ class Lines:
     def _clean(self, line: bytes) -> bytes:
         """Remove the carriage return of a line that is neither too long, empty nor not UTF-8."""
         if len(line) > self.max_length:
-            raise Rejected('longer than max_length')
+            raise fields.Rejected('longer than max_length')
         if not line.isascii():
             try:
                 line.decode()
             except UnicodeDecodeError:
-                raise Rejected('that are not UTF-8') from None
+                raise fields.Rejected('that are not UTF-8') from None
         line = line.removesuffix(b'\r')
         if not line or line.isspace():
-            raise Rejected('that are empty')
+            raise fields.Rejected('that are empty')
         return line
 
 
@@ -127,18 +113,19 @@ class TextFraming:
 
     def __init__(self, settings: TextSettings) -> None:
         self._lines = Lines(settings.end, settings.max_length)
-        fields = settings.fields
+        names = settings.fields
         self._date: tuple[int, int] | None = None
-        if DATE in fields:
-            if 'ticks' not in fields:
+        if DATE in names:
+            if 'ticks' not in names:
                 raise SettingsError('fields: date needs ticks, the time of day')
-            self._date = fields.index(DATE), fields.index('ticks')
-        self._layout = FieldLayout([SKIP if name == DATE else name for name in fields],
-                                   settings.each, settings.count)
-        self._prefix = decode_escapes('prefix', settings.prefix)
-        self._comment = decode_escapes('comment', settings.comment)
-        self._has_checksum = check_choice('checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
-        separator = decode_escapes('separator', settings.separator)
+            self._date = names.index(DATE), names.index('ticks')
+        self._layout = fields.FieldLayout([fields.SKIP if name == DATE else name for name in names],
+                                          settings.each, settings.count)
+        self._prefix = fields.decode_escapes('prefix', settings.prefix)
+        self._comment = fields.decode_escapes('comment', settings.comment)
+        self._has_checksum = fields.check_choice(
+            'checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
+        separator = fields.decode_escapes('separator', settings.separator)
         self._separator = None if separator == b' ' else separator
         if settings.decimal == ',' and b',' in separator:
             raise SettingsError('decimal: a comma cannot be both separator and decimal mark; set '
@@ -147,7 +134,6 @@ class TextFraming:
         self._check_settings(separator)
 
     def _check_settings(self, separator: bytes) -> None:
-        """Raise SettingsError if separator, prefix or comment prefix prevents correct parsing."""
         if not separator or re.search(rb'[0-9A-Za-z+.-]', separator):
             raise SettingsError(f'separator: {separator!r} is empty or can be part of a number')
         if self._lines.end in separator:
@@ -164,16 +150,16 @@ class TextFraming:
         return self._lines.parse(data, final, self._read)
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Extract the readings of one line."""
         if self._comment and line.startswith(self._comment):
-            raise Rejected('that are comments')
+            raise fields.Rejected('that are comments')
         if not line.startswith(self._prefix):
-            raise Rejected('without the prefix')
+            raise fields.Rejected('without the prefix')
         if self._has_checksum:
             line = _strip_checksum(line)
         values = line[len(self._prefix):].split(self._separator)
         if len(values) != len(self._converters):
-            raise Rejected('with an unexpected number of fields', self._width_remedy(line, values))
+            raise fields.Rejected('with an unexpected number of fields',
+                                  self._width_remedy(line, values))
         if self._date is not None:
             date, time = self._date
             values[time] = values[date] + b' ' + values[time]
@@ -181,7 +167,6 @@ class TextFraming:
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 
     def _width_remedy(self, line: bytes, values: list[bytes]) -> str:
-        """Explain a line with an unexpected number of values."""
         n = len(self._converters)
         for name, separator in (("';'", b';'), ("'\\t'", b'\t'), ("' '", None), ("','", b',')):
             if len(line[len(self._prefix):].split(separator)) == n:
@@ -191,22 +176,21 @@ class TextFraming:
 
 
 def _strip_checksum(line: bytes) -> bytes:
-    """Verify and remove the checksum `*hh`."""
     if line[-3:-2] != b'*':
-        raise Rejected('without a checksum')
+        raise fields.Rejected('without a checksum')
     line, digits = line[:-3], line[-2:]
     if digits.upper() != b'%02X' % xor8(line.removeprefix(b'$')):
-        raise Rejected('with a wrong checksum')
+        raise fields.Rejected('with a wrong checksum')
     return line
 
 
 def _converter(quantity: str, decimal: str) -> Callable[[bytes], object]:
     """Function that converts the bytes of a quantity to a value for `FieldLayout.readings`."""
-    if quantity in AXES:
+    if quantity in fields.AXES:
         return _axis if decimal == '.' else lambda text: _axis(text.replace(b',', b'.'))
     converters: dict[str, Callable[[bytes], object]] = {
         'ticks': lambda text: _ticks(text, decimal), 'sequence': _sequence, 'sensor': _sensor,
-        SKIP: ignore_value}
+        fields.SKIP: fields.ignore_value}
     return converters[quantity]
 
 
@@ -214,28 +198,26 @@ def _axis(text: bytes) -> float:
     """Parse an axis, NaN if missing."""
     text = text.strip(b' \t"')
     if _NUMBER(text):
-        return axis_value(text)
+        return fields.axis_value(text)
     if _MISSING(text):
         return float('nan')
     if _INFINITE(text):
-        raise Rejected('with an infinite number')
-    raise Rejected('with a value that is not a number', decimal_remedy(text.decode()))
+        raise fields.Rejected('with an infinite number')
+    raise fields.Rejected('with a value that is not a number', fields.decimal_remedy(text.decode()))
 
 
 def _ticks(text: bytes, decimal: str) -> float:
-    """Parse a device time, a number or a date."""
     text = text.strip(b' \t"')
-    return ticks_value(math.nan) if _MISSING(text) else text_ticks(text.decode(), decimal)
+    return fields.ticks_value(math.nan) if _MISSING(text) else \
+        fields.text_ticks(text.decode(), decimal)
 
 
 def _sequence(text: bytes) -> int:
-    """Parse a sequence number of at most 64 bits."""
     text = text.strip(b' \t"')
     if not _INTEGER(text):
-        raise Rejected('with a sequence number that is not an integer')
-    return sequence_value(int(text))
+        raise fields.Rejected('with a sequence number that is not an integer')
+    return fields.sequence_value(int(text))
 
 
 def _sensor(text: bytes) -> str:
-    """Parse the name of a sensor."""
-    return sensor_name(text.strip(b' \t"').decode())
+    return fields.sensor_name(text.strip(b' \t"').decode())

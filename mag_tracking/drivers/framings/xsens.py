@@ -103,8 +103,7 @@ def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | Axes | No
 
 
 def read_mtdata2(data: bytes) -> DecodedMessage | None:
-    """Decode DATA of an MTData2 message; None if the packets do not fill it, or a used one has an
-    invalid length.
+    """Decode DATA of an MTData2 message; None if a packet has a wrong length.
 
     A packet is an identifier (u16), the length of its data (u8), and the data. SampleTimeCoarse
     (0x1070) is too coarse for a clock.
@@ -136,7 +135,6 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
 
 
 def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Message from {attribute of `Reading`: value}."""
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
@@ -188,6 +186,8 @@ _PREAMBLE = b'\xfa'
 _START = b'\xfa\xff'
 _MTDATA, _MTDATA2, _WAKE_UP, _ERROR = 0x32, 0x36, 0x3E, 0x42
 _DATA_MESSAGES = (_MTDATA, _MTDATA2)
+_FROM_DEVICE = (*_DATA_MESSAGES, _WAKE_UP, _ERROR)
+"""Even types of the messages that devices send."""
 _EXTENDED_LENGTH = 0xFF
 _MAX_OVERHEAD = 7
 """Number of bytes outside DATA in a message with extended length."""
@@ -231,19 +231,13 @@ _WAIT_STEP = _ParseStep(0)
 _REJECT_STEP = _ParseStep(1)
 
 
-def _is_from_device(mid: int) -> bool:
-    """Whether devices send messages of this type."""
-    return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
-
-
 def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
-    """Message with DATA of at most `longest` bytes that may begin at `index` of `window`, or
-    None."""
+    """Message with DATA of at most `longest` bytes that may begin at `index`, or None."""
     # While the header is incomplete, MID is -1 and the end is one byte after the window.
     header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
         return None
-    if len(header) > 2 and not _is_from_device(header[2]):
+    if len(header) > 2 and header[2] % 2 == 0 and header[2] not in _FROM_DEVICE:
         return None
     if len(header) < 4 or header[3] == _EXTENDED_LENGTH and len(header) < 6:
         return _Message(-1, len(window), len(window) + 1)
@@ -256,7 +250,6 @@ def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
 
 
 def _is_checksum_valid(window: bytes, index: int, message: _Message) -> bool:
-    """Whether the sum of all bytes but the preamble is a multiple of 256."""
     return sum(window[index + 1:message.end]) % 256 == 0
 
 
@@ -265,9 +258,8 @@ class XsensFraming:
 
     A reading has the field in arbitrary units (1 is the magnitude of the field where Xsens
     calibrated the sensor), the acceleration in m/s², the packet counter as sequence (modulo 2^16),
-    and SampleTimeFine as ticks (10 kHz). Quantities that the device does not send are None. A
-    message with neither field nor acceleration is counted, and its sequence number is counted as
-    lost.
+    and SampleTimeFine as ticks (10 kHz). Quantities that are not sent are None. A message with
+    neither field nor acceleration is counted, and its sequence number is counted as lost.
     """
 
     SETTINGS = XsensSettings
@@ -330,8 +322,7 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Step that rejects `outer` for another data message in it, or waits for more bytes; None
-        without a message."""
+        """Step that rejects `outer` for a data message in it, or waits for bytes; None without."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
@@ -362,7 +353,6 @@ class XsensFraming:
         return found
 
     def _decode(self, window: bytes, message: _Message) -> DecodedMessage | None:
-        """Decode a data message; None if the message is malformed or of another type."""
         data = window[message.begin:message.end - 1]
         if message.mid == _MTDATA2:
             return read_mtdata2(data)
@@ -371,7 +361,6 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """Cause under which a message without a reading is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:
                 return 'MTData messages, although mtdata is none'

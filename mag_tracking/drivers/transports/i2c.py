@@ -30,16 +30,13 @@ from mag_tracking.drivers.chips.continuous import Lis3mdl, Lis3mdlSettings, Rm31
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
 from mag_tracking.drivers.chips.memsic import Mmc5603, Mmc5603Settings, Mmc5983ma, Mmc5983maSettings
 from mag_tracking.drivers.reading import Arrival, Reading
-from mag_tracking.drivers.transports.polled import Closable
+from mag_tracking.drivers.transports.polled import CLOSE_WAIT_S, Closable
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 from mag_tracking.units import field_scale
 
-CLOSE_WAIT_S = 0.1
-"""[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
 _CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
-"""Supported chips by name."""
 NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
 ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
                    r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?(:(?P<unit>[^:]+))?')
@@ -56,7 +53,6 @@ class Sensor(NamedTuple):
 
 
 def _parse_sensors(entries: Sequence[str]) -> list[Sensor]:
-    """Parse the entries name:chip:address[@multiplexer.channel][:unit] of a bus."""
     sensors = [_parse_sensor(entry) for entry in entries]
     multiplexers = {s.location.multiplexer for s in sensors} - {None}
     for i, sensor in enumerate(sensors):
@@ -76,7 +72,6 @@ def _parse_sensors(entries: Sequence[str]) -> list[Sensor]:
 
 
 def _parse_sensor(entry: str) -> Sensor:
-    """Parse one entry; the chip is one of `CHIPS` or a module.Class."""
     match = ENTRY.fullmatch(entry)
     if match is None:
         raise SettingsError('sensors: expected name:chip:0xNN or name:chip:0xNN@0xNN.channel, '
@@ -103,7 +98,6 @@ def _parse_sensor(entry: str) -> Sensor:
 
 
 def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:
-    """Parse the digits of an address from `lowest` to 0x77."""
     address = int(digits, 16)
     if not lowest <= address <= 0x77:
         raise SettingsError(f'sensors: {name}: {role} {address:#04x} is outside '
@@ -186,7 +180,6 @@ class I2cDevice(Closable):
             self._n_silent.clear()
 
     def _create_chips(self, bus: Bus) -> dict[str, Chip]:
-        """Create the chips {sensor name: chip} without access to the bus."""
         chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
             registers = Registers(bus, sensor.location)
@@ -199,11 +192,9 @@ class I2cDevice(Closable):
         return chips
 
     def _count(self, cause: str, name: str) -> None:
-        """Count a loss by cause and sensor."""
         self.counts[f'{cause}: {name}'] += 1
 
     def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
-        """Identify and configure a chip."""
         sensor = self._sensors[name]
         label = f'{self._name}: {name} ({sensor.chip}, {sensor.location})'
         registers = Registers(bus, sensor.location)
@@ -217,7 +208,6 @@ class I2cDevice(Closable):
             raise DeviceError(f'{label}: {self._fault(error)}') from error
 
     def _fault(self, error: OSError) -> str:
-        """Explanation of a bus error, with the remedy."""
         if error.errno in NO_ANSWER_ERRNOS:
             return ('no answer; check wiring, power supply, and the address with i2cdetect -y '
                     f'{self._settings.bus}')
@@ -310,7 +300,6 @@ class I2cDevice(Closable):
             self._loss = f'{self._name}: {name} failed in {cycles}: {self._fault(error)}'
 
     def _release(self) -> None:
-        """Close the bus if it is open."""
         self._loss = ''
         if self._bus is not None:
             self._bus.smbus.close()
@@ -318,7 +307,6 @@ class I2cDevice(Closable):
 
 
 def _identity_hint(registers: Registers) -> str:
-    """Name the first supported chip whose identity matches the registers, if any."""
     for name, chip in CHIPS.items():
         try:
             chip.check_identity(registers)
@@ -329,7 +317,6 @@ def _identity_hint(registers: Registers) -> str:
 
 
 def _open_error(error: OSError) -> str:
-    """Reason why a bus cannot be opened, with the remedy."""
     if error.errno == errno.ENOENT:
         return ('not found; enable I2C (on a Raspberry Pi: raspi-config), load the module with '
                 'sudo modprobe i2c-dev, and list the buses with i2cdetect -l')

@@ -27,11 +27,9 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from mag_tracking.drivers.reading import Chunk
+from mag_tracking.drivers.transports.polled import CLOSE_WAIT_S
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
-
-CLOSE_WAIT_S = 0.1
-"""[s] Maximum delay between a call of `close` and the end of the network thread."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,6 @@ class _TlsContext(ssl.SSLContext):
     """TLS context with an immediate handshake; a failed handshake closes the socket."""
 
     def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
-        """Wrap a socket in TLS and perform the handshake immediately."""
         return super().wrap_socket(sock, *args, **(kwargs | {'do_handshake_on_connect': True}))
 
 
@@ -126,7 +123,6 @@ class MqttTopics:
                               f'{self.settings.connect_timeout_s:g} s; is it an MQTT broker?')
 
     def _client(self) -> paho.Client:
-        """Create a client."""
         s = self.settings
         client = paho.Client(
             CallbackAPIVersion.VERSION2, s.client_id or f'mag_tracking_{secrets.token_hex(4)}',
@@ -141,7 +137,6 @@ class MqttTopics:
         return client
 
     def _tls_context(self) -> ssl.SSLContext:
-        """TLS context with the trusted CA certificates."""
         path = self.settings.ca_file
         # A context of this type requires a certificate that matches the host name.
         context = _TlsContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -156,7 +151,6 @@ class MqttTopics:
         return context
 
     def _password(self) -> str | None:
-        """Read the password; None if no file is configured."""
         path = self.settings.password_file
         if not path:
             return None
@@ -171,7 +165,6 @@ class MqttTopics:
         return password
 
     def _connect(self, client: paho.Client) -> None:
-        """Connect the client, with TLS if configured."""
         s = self.settings
         try:
             client.connect(s.host, s.port, s.keepalive_s)
@@ -228,7 +221,6 @@ class MqttTopics:
             self._changed.notify_all()
 
     def _on_message(self, client: paho.Client, _: Any, message: paho.MQTTMessage) -> None:
-        """Append a message to the queue, or count the cause of its rejection."""
         arrival_ns = time.monotonic_ns()
         with self._changed:
             if message.dup:
@@ -279,7 +271,6 @@ class MqttTopics:
             return chunks
 
     def _add_thread_counts(self) -> None:
-        """Add the counts of the network thread to `counts`."""
         self.counts += self._thread_counts
         self._thread_counts.clear()
 

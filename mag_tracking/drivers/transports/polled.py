@@ -8,7 +8,7 @@ import time
 from typing import Generic, TypeVar
 
 CLOSE_WAIT_S = 0.1
-"""[s] Maximum time that `close` waits for a `read` in another thread."""
+"""[s] Maximum time that `close` waits for a `read` or, on a bus, for the cycle after it."""
 H = TypeVar('H', bound=io.RawIOBase | socket.socket)
 
 

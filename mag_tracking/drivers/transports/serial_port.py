@@ -84,7 +84,6 @@ class SerialPort(Polled[serial.Serial]):
                 self._line_errors = None
 
     def _open_error(self, error: Exception) -> str:
-        """Reason why the port cannot be opened, with the remedy."""
         code = getattr(error, 'errno', None)
         if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
             available = ', '.join(f'{p.device} ({p.description})' for p in list_ports.comports())
@@ -106,9 +105,10 @@ class SerialPort(Polled[serial.Serial]):
                 raise DeviceError(f'serial port {self._settings.port}: not open')
             try:
                 arrival_ns = self._wait(timeout_s)
-                if self._line_errors is not None:
-                    before, self._line_errors = self._line_errors, _line_errors_of(self._handle)
-                    self._count_line_errors(before, self._line_errors)
+                if (before := self._line_errors) is not None:
+                    self._line_errors = now = _line_errors_of(self._handle)
+                    self.counts.update({cause: (now[i] - before[i]) % 2**32
+                                        for i, cause in LINE_ERRORS.items() if now[i] != before[i]})
                 if arrival_ns is None:
                     return []
                 data = self._handle.read(max(1, self._handle.in_waiting))
@@ -116,12 +116,6 @@ class SerialPort(Polled[serial.Serial]):
                 raise DeviceError(f'serial port {self._settings.port}: connection lost; check '
                                   f'that the device is plugged in ({error})') from error
         return [Chunk(arrival_ns, data)] if data else []
-
-    def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
-        """Count the line errors between two states of the kernel's error counters."""
-        for i, cause in LINE_ERRORS.items():
-            if now[i] != before[i]:
-                self.counts[cause] += (now[i] - before[i]) % 2**32
 
 
 def _line_errors_of(port: serial.Serial) -> tuple[int, ...]:

@@ -30,7 +30,6 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 
 MAX_DATAGRAMS_PER_READ = 1000
-"""Maximum number of datagrams per `read`."""
 CLOCK_SET_NS = 1_000_000
 """[ns] A larger change of the clock difference indicates that the wall clock was set."""
 SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
@@ -137,7 +136,6 @@ class UdpSocket(Polled[socket.socket]):
         opened.bind((s.group or s.address, s.port))
 
     def _open_error(self, error: OSError) -> str:
-        """Reason why the socket cannot be opened, with the remedy."""
         s = self.settings
         if error.errno == errno.EADDRINUSE:
             return 'the port is in use by another program; choose another port'
@@ -164,7 +162,6 @@ class UdpSocket(Polled[socket.socket]):
         return chunks
 
     def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
-        """Receive the queued datagrams; return the accepted datagrams as chunks."""
         datagrams: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
         is_empty = False
         ancillary_size = socket.CMSG_SPACE(TIMESPEC.size)
@@ -185,16 +182,14 @@ class UdpSocket(Polled[socket.socket]):
                 if self._accept(data, flags, ip)]
 
     def _accept(self, data: bytes, flags: int, ip: str) -> bool:
-        """Return whether a datagram is accepted; count a rejected datagram."""
         if not self._any_source and ip not in self._sources:
-            self.counts['datagrams from other sources'] += 1
+            cause = 'datagrams from other sources'
         elif flags & socket.MSG_TRUNC:
-            self.counts['datagrams longer than max_length'] += 1
-        elif not data:
-            self.counts['empty datagrams'] += 1
+            cause = 'datagrams longer than max_length'
         else:
-            return True
-        return False
+            cause = '' if data else 'empty datagrams'
+        self.counts.update([cause] if cause else [])
+        return not cause
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
         """Monotonic arrival time of a datagram, ns, from the timestamp in `ancillary`; `woken_ns`
@@ -209,7 +204,6 @@ class UdpSocket(Polled[socket.socket]):
         return woken_ns
 
     def _count_drops(self, opened: socket.socket) -> None:
-        """Count the datagrams that the kernel has dropped since the previous call."""
         drops = MEMINFO.unpack(
             opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS_INDEX]
         if drops != self._drops:
