@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mag_tracking.apps.doctor import Doctor, examine
-from mag_tracking.apps.doctor_report import write_report
+from mag_tracking.apps.doctor import Doctor, examine, write_report
 from mag_tracking.cli.options import (
     Commands,
     add_command,

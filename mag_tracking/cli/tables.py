@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
-from mag_tracking.apps.traffic import CountedVehicle, EventSink, TrafficResult, TrafficSink
+from mag_tracking.apps import traffic
 from mag_tracking.cli.options import check_writable
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import PassEvent
@@ -76,9 +75,9 @@ class Events:
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
         self._names = network.names
 
-    def sink(self, name: str, pipeline: Pipeline) -> EventSink:
+    def sink(self, name: str, pipeline: Pipeline) -> traffic.EventSink:
         """Return the sink of a recording."""
-        self._sink = EventSink(pipeline)
+        self._sink = traffic.EventSink(pipeline)
         return self._sink
 
     def finish(self, name: str, report: RunReport, out: Path | None) -> None:
@@ -121,16 +120,16 @@ class Passages:
         self._tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
         self._enrolled: list[FleetPass] = []
 
-    def sink(self, name: str, pipeline: Pipeline) -> TrafficSink:
+    def sink(self, name: str, pipeline: Pipeline) -> traffic.TrafficSink:
         """Return the sink of a recording."""
-        self._sink = TrafficSink(pipeline)
+        self._sink = traffic.TrafficSink(pipeline)
         return self._sink
 
     def finish(self, name: str, report: RunReport, out: Path | None) -> None:
         """Print and write the passages of a recording; enrol the vehicle after the last one."""
         result, fleet = self._sink.result(report), self._fleet
         if self._args.enrol is not None and not self._stopped():
-            self._enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
+            self._enrolled.append(traffic.pass_of(name, [v.passage for v in result.vehicles]))
         identifications = [None if fleet is None else fleet.identify(v.passage)
                            for v in result.vehicles]
         _print(name, result, identifications)
@@ -148,32 +147,32 @@ class Passages:
             _enrol(self._args, self._network, self._enrolled)
 
 
-def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
+def _fleet(args: argparse.Namespace, network: SensorNetwork) -> traffic.Fleet | None:
     """Check --fleet and --enrol; return the fleet, or None with --enrol or without --fleet."""
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
         if args.enrol.strip() in ('', UNKNOWN):
             raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
-        earth_field_strength(network)
+        traffic.earth_field_strength(network)
         check_writable(args.fleet)
         return None
-    return None if args.fleet is None else Fleet(read_fleet(args.fleet), network)
+    return None if args.fleet is None else traffic.Fleet(read_fleet(args.fleet), network)
 
 
 def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetPass]) -> None:
     """Add passes of the vehicle named by --enrol to the fleet file."""
     fleet = read_fleet(args.fleet) if args.fleet.exists() else {}
     fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
-    # Fleet raises an error before a vehicle that cannot be enrolled is written.
-    vehicle = next(v for v in Fleet(fleet, network).vehicles if v.name == args.enrol)
+    # `Fleet` raises an error before a vehicle that cannot be enrolled is written.
+    vehicle = next(v for v in traffic.Fleet(fleet, network).vehicles if v.name == args.enrol)
     write_fleet(args.fleet, fleet)
     at = 'any heading' if vehicle.iron is not None else \
         f'a heading of {np.degrees(vehicle.heading):.0f} degrees only'
     print(f'{args.fleet}: {args.enrol} is recognised at {at} (passes: {len(fleet[args.enrol])})')
 
 
-def _print(name: str, result: TrafficResult,
+def _print(name: str, result: traffic.TrafficResult,
            identifications: Sequence[Identification | None]) -> None:
     """Print one line per vehicle, the counts, and warnings."""
     for vehicle, identification in zip(result.vehicles, identifications, strict=True):
@@ -194,7 +193,7 @@ def _print(name: str, result: TrafficResult,
         print(f'  {result.report.no_track_reason}')
 
 
-def _passage_line(vehicle: CountedVehicle) -> str:
+def _passage_line(vehicle: traffic.CountedVehicle) -> str:
     """Describe a passage in one line."""
     p = vehicle.passage
     error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
