@@ -158,7 +158,6 @@ class Pipeline:
         return out
 
     def _process_frame(self, frame: FieldFrame) -> Iterator[Output]:
-        """Yield the records that result from a frame."""
         if 'detect' not in self._names:
             yield frame
             return
@@ -207,7 +206,11 @@ _RECEIVERS = {
 
 
 class RecordReceiver:
-    """Sink that passes each record to the method for its type; subclasses override some."""
+    """Sink that passes each record to the method of `_RECEIVERS` for its type, where there is one.
+
+    `add_frame` precedes `add_track` of the same time. `add_disturbance` receives a disturbance when
+    it is detected and again when it has ended.
+    """
 
     def add(self, step: Step) -> None:
         """Receive the records of a step."""
@@ -216,29 +219,6 @@ class RecordReceiver:
     def receive(self, records: Iterable[object]) -> None:
         """Receive records in order of processing."""
         for record in records:
-            if name := _RECEIVERS.get(type(record)):
-                getattr(self, name)(record)
-
-    def add_calibrated(self, readings: Readings) -> None:
-        """Receive a batch of calibrated readings."""
-
-    def add_frame(self, frame: FieldFrame) -> None:
-        """Receive a frame, which precedes its tracks."""
-
-    def add_detection(self, detection: Detection) -> None:
-        """Receive the onset or release of a detection."""
-
-    def add_track(self, track: Track) -> None:
-        """Receive a pose, or the closing record of a track."""
-
-    def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Receive a smoothed pose."""
-
-    def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Receive a disturbance, when it is detected and again when it has ended."""
-
-    def add_passage(self, passage: VehiclePassage) -> None:
-        """Receive the passage of a vehicle."""
-
-    def add_traffic(self, summary: TrafficSummary) -> None:
-        """Receive the summary of the traffic in an interval."""
+            method = getattr(self, _RECEIVERS.get(type(record), ''), None)
+            if method is not None:
+                method(record)

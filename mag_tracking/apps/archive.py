@@ -25,7 +25,6 @@ from mag_tracking.results.parquet_table import import_pyarrow
 _Cluster = Cluster[tuple[str, Job]]
 
 METADATA = 'metadata.yaml'
-"""Name of the file that marks a folder as a rosbag2 recording."""
 
 
 @dataclass
@@ -40,9 +39,7 @@ class ArchiveRun:
     passes: int = 0
     """Number of fitted passes, one per vehicle."""
     lost_workers: int = 0
-    """Number of lost workers, whose tasks were repeated."""
     interrupted: bool = False
-    """Whether the run was stopped before all recordings were tracked."""
 
 
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:

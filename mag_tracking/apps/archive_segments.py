@@ -35,7 +35,6 @@ CHUNK_FRAMES = 2000
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
 TRACKED_FILE = 'tracked.json'
-"""Name of the file with the result of a tracked segment."""
 Doubts = InputDoubts
 """{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]

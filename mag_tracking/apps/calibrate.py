@@ -9,18 +9,9 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration import network_geometry, orientation
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
 from mag_tracking.calibration.network_fit import GeometrySettings
-from mag_tracking.calibration.network_geometry import (
-    NetworkGeometry,
-    calibrate_geometry,
-    calibrate_geometry_blind,
-)
-from mag_tracking.calibration.orientation import (
-    MountingEvidence,
-    fuse_mounting,
-    with_pass_mounting,
-)
 from mag_tracking.calibration.survey import NetworkSurvey, Survey, with_measured_noise
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import CalibrationRecord, SensorNetwork
@@ -52,14 +43,12 @@ class Calibration:
 
     network: SensorNetwork
     survey: NetworkSurvey
-    evidence: MountingEvidence | None
+    evidence: orientation.MountingEvidence | None
     """Orientations from passing targets; None if no pass was used."""
     rejected: dict[str, int]
     """Rejected samples: {cause: number}."""
     without_background: tuple[str, ...]
-    """Sensors whose background was not learnt."""
     interrupted: bool
-    """Whether the calibration was stopped before the end of the recording."""
 
 
 def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
@@ -89,9 +78,10 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
             prior = np.array([
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
                 for s in surveyed.orientation_std])
-            evidence = fuse_mounting(surveyed, prior, tracks)
+            evidence = orientation.fuse_mounting(surveyed, prior, tracks)
             used = quantity(evidence.n_tracks, 'pass', 'passes')
-            calibrated = replace(with_pass_mounting(surveyed, evidence), calibrated=tuple(
+            fused = orientation.with_pass_mounting(surveyed, evidence)
+            calibrated = replace(fused, calibrated=tuple(
                 surveyed.calibration_record(j, date, f'nominal orientation; {used}')
                 if record is None else replace(record, date=date, by=f'{record.by}; {used}')
                 for j, record in enumerate(surveyed.calibrated)))
@@ -134,7 +124,6 @@ class _PassTracks(RecordReceiver):
         self._poses: dict[int, tuple[int, Track]] = {}
 
     def add_track(self, track: Track) -> None:
-        """Count a pose."""
         if not track.ended and not track.ambiguous:
             self._poses[track.id] = self._poses.get(track.id, (0, track))[0] + 1, track
 
@@ -201,13 +190,12 @@ class GeometrySurvey:
     """Network before the calibration, including the assumed noise."""
     network: SensorNetwork
     """Calibrated network; invalid if the estimation has not converged."""
-    geometry: NetworkGeometry
+    geometry: network_geometry.NetworkGeometry
     rows: IntArray
     """(K,) table rows of the poses used."""
     suspect_rows: tuple[int, ...]
     """Table rows of inconsistent poses."""
     n_poses: int
-    """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
     """(sensor, axes without readings) for each sensor that reports some axes but not all."""
 
@@ -261,10 +249,11 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     try:
         if box is not None:
             low, high = (np.asarray(corner, dtype=float) for corner in box)
-            geometry = calibrate_geometry_blind(nominal, field, moment, low, high, settings)
+            geometry = network_geometry.calibrate_geometry_blind(
+                nominal, field, moment, low, high, settings)
         else:
-            geometry = calibrate_geometry(nominal, field[used], positions[used], axes[used],
-                                          moment, settings)
+            geometry = network_geometry.calibrate_geometry(
+                nominal, field[used], positions[used], axes[used], moment, settings)
     except ValueError as error:
         raise RecordingError(f'{table}: {error}') from error
     method = f'magnet, {len(geometry.rows)} {"unknown" if box is not None else "tracked"} poses'
@@ -299,8 +288,8 @@ def _corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
     return field
 
 
-def _calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
-                        method: str) -> SensorNetwork:
+def _calibrated_network(network: SensorNetwork, geometry: network_geometry.NetworkGeometry,
+                        date: str, method: str) -> SensorNetwork:
     """Network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes

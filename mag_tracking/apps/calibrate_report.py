@@ -77,7 +77,6 @@ def _rotations(calibration: Calibration, nominal: SensorNetwork,
 
 
 def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[page.Chart]:
-    """Charts of the first knock and of the rotations about the vertical."""
     for title, curves in _knocks(calibration):
         if curves:
             yield page.Chart(
@@ -95,7 +94,6 @@ def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[page.C
 
 
 def _table(calibration: Calibration) -> page.Table:
-    """Table of the orientation, clock offset and noise of each sensor."""
     network, rows = calibration.network, list[list[str | float | None]]()
     for j, name in enumerate(network.names):
         R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
@@ -208,7 +206,6 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
 
 
 def _set_title(axes: Axes, title: str) -> None:
-    """Set the title of axes of a board."""
     axes.set_title(title, fontsize=10, loc='left')
 
 
@@ -259,7 +256,6 @@ def _plot_displacements(figure: SubFigure, axes: Axes, survey: GeometrySurvey,
 
 
 def _plot_pose_residuals(axes: Axes, survey: GeometrySurvey) -> None:
-    """Plot the residual of each magnet pose against its row in the table of poses."""
     suspect = np.isin(survey.rows, survey.suspect_rows)
     residual = survey.geometry.pose_residual
     axes.plot(survey.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')

@@ -28,7 +28,6 @@ FIRST_WORKER_TIMEOUT_S = 60.0
 THREAD_START_TIMEOUT_S = 60.0
 NO_WORKERS_TIMEOUT_S = 180.0
 LOCAL_ADDRESS = '127.0.0.1'
-"""Address on which the processes on this machine listen."""
 TLS_VARIABLES = ', '.join(f'DASK_DISTRIBUTED__COMM__TLS__{name}'
                           for name in ('CA_FILE', 'CLIENT__CERT', 'CLIENT__KEY'))
 """Environment variables of Dask with the files for a scheduler at tls://..."""
@@ -104,7 +103,6 @@ class Cluster(Generic[_Key]):
         self._run(_Task(key, priority, task, arguments, False))
 
     def _run(self, task: _Task) -> None:
-        """Submit a task to the scheduler."""
         self._running[self._client.submit(task.call, *task.arguments, pure=False,
                                           priority=task.priority)] = task
 

@@ -22,16 +22,9 @@ from mag_tracking.stages.calibrate.field_comparison import (
     earth_field_findings,
 )
 from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
+from mag_tracking.stages.health import findings
 from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
-from mag_tracking.stages.health.findings import (
-    background_findings,
-    covariance_findings,
-    driver_findings,
-    rate_findings,
-    rejection_findings,
-    source_findings,
-)
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, SensorHealth
 from mag_tracking.units import NS
 
@@ -112,7 +105,7 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
                      sensors: Mapping[str, SensorHealth]) -> list[Finding]:
     """Diagnose faults that are visible only by comparing the clocks and the fields of sensors."""
     clocks = {name: health.clock for name, health in sensors.items()}
-    findings = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
+    found = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
     backgrounds = calibrate.backgrounds()
     levels = np.array([
         calibrate.background(name) if backgrounds[name].measured
@@ -121,11 +114,10 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     try:
-        return findings + earth_field_findings(compared_with_earth(network, survey, levels))
+        return found + earth_field_findings(compared_with_earth(network, survey, levels))
     except ValueError as error:
-        return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
-                                   'add earth_field or site to the network file',
-                                   Cause.NOT_COMPARED)]
+        return [*found, Finding(False, 'network', f'sensors were not compared: {error}',
+                                'add earth_field or site to the network file', Cause.NOT_COMPARED)]
 
 
 class Doctor:
@@ -182,12 +174,14 @@ class Doctor:
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
-            found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
-            found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
-            found += driver_findings(name, self.calibrate)
-            found += rejection_findings(name, self.calibrate)
-            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
-                                   self._settings.track)
+            found += findings.background_findings(name, self.calibrate,
+                                                  self._frozen_since_ns.get(name))
+            found += findings.covariance_findings(name, self.network.absolute_topics[j],
+                                                  self.calibrate)
+            found += findings.driver_findings(name, self.calibrate)
+            found += findings.rejection_findings(name, self.calibrate)
+            found += findings.rate_findings(name, self.calibrate.lowest_rate(name), self.network,
+                                            self._settings.track)
         for name, missed in self._missed.items():
             for other, n in missed.most_common(1):
                 if n >= MIN_MISSED_TARGETS:
@@ -211,7 +205,7 @@ def examine(source: RecordingSource, network: SensorNetwork, settings: Settings,
     about the recording, which it lacks."""
     doctor = Doctor(Pipeline(network, settings, 'calibrate'))
     run(source, doctor.pipeline, [doctor], progress, stopped)
-    return doctor, source_findings(source.name, source.lost, source.rejected)
+    return doctor, findings.source_findings(source.name, source.lost, source.rejected)
 
 
 def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
@@ -227,7 +221,6 @@ def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
 
 
 def _charts(doctor: Doctor) -> list[page.Chart]:
-    """Charts of the noise of each axis and of the sample rates."""
     names = [escape(name, quote=False) for name in doctor.sensors]
     noise = [{'type': 'bar', 'x': names, 'name': letter, 'marker': {
         'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
@@ -241,7 +234,6 @@ def _charts(doctor: Doctor) -> list[page.Chart]:
 
 
 def _table(doctor: Doctor) -> page.Table:
-    """Table of the readings, faults, field and delay of each sensor."""
     rows: list[list[str | float | None]] = []
     for name, health in doctor.sensors.items():
         c, delay = health.counts, float(health.delay_s[0])

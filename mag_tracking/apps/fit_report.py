@@ -19,11 +19,9 @@ from mag_tracking.results.result_folder import REPORT
 from mag_tracking.units import NS
 
 MAX_SENSORS = 6
-"""Maximum number of sensors in the figure of a pass."""
 RECORDING_GAP_S = 5.0
 """Gap between two recordings on the time axis of the page [s]."""
 N_POSES = 120
-"""Number of poses shown per pass."""
 
 
 def pass_figure(fit: PassFit, title: str) -> Figure:
@@ -166,7 +164,6 @@ def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
 
 
 def _times(fit: PassFit) -> FloatArray:
-    """Times (n,) [s] of the poses that are shown."""
     return np.linspace(fit.data.t.min(), fit.data.t.max(), N_POSES)
 
 
@@ -197,7 +194,6 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float)
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> page.Chart:
-    """Chart of the normalised cost against the number of dipoles."""
     traces = []
     for k, fitted in enumerate(passes):
         fits = [f for f in fitted.fits if len(f.x)]

@@ -18,7 +18,6 @@ from mag_tracking.recording.sample_reader import fault_of
 from mag_tracking.units import NS
 
 BATCH_SIZE = 4096
-"""Number of messages that are decoded at once."""
 GAP_INTERVALS, MIN_GAP_S = 10.0, 1.0
 """A gap is longer than this number of median intervals, and, if messages come in bursts, than this
 time [s]."""

@@ -7,16 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.placement import (
-    DIRECTIONS,
-    STATES,
-    PlannedTarget,
-    Sampling,
-    bounds_of,
-    detection_probabilities,
-    pass_fields,
-    pass_information,
-)
+from mag_tracking.analysis import placement
 from mag_tracking.apps.plan_inputs import Area, LaneLine, plan_inputs
 from mag_tracking.apps.readings import network_of
 from mag_tracking.arrays import FloatArray
@@ -60,9 +51,9 @@ class Plan:
 
     network: SensorNetwork
     """Planned network."""
-    target: PlannedTarget
+    target: placement.PlannedTarget
     """Assumed target."""
-    sampling: Sampling
+    sampling: placement.Sampling
     """Noise and sampling of the sensors."""
     x: FloatArray
     """(nx,) m, coordinates of the maps."""
@@ -165,8 +156,9 @@ def _directions(lanes: Sequence[LaneLine]) -> list[float]:
     return sorted({heading % np.pi for _, heading, _ in lanes})
 
 
-def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-                 lanes: Sequence[LaneLine], area: Area, settings: Settings,
+def compute_plan(network: SensorNetwork, target: placement.PlannedTarget,
+                 sampling: placement.Sampling, lanes: Sequence[LaneLine], area: Area,
+                 settings: Settings,
                  clearance: float = 0.0, n_grid: int = 41,
                  progress: Callable[[int], object] | None = None) -> Plan:
     """Compute bounds, detection probabilities and the best position of an additional sensor.
@@ -223,26 +215,27 @@ def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 class _Passes:
     """Passes of a target over a network, for all directions of its moment."""
 
-    def __init__(self, network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-                 settings: Settings) -> None:
+    def __init__(self, network: SensorNetwork, target: placement.PlannedTarget,
+                 sampling: placement.Sampling, settings: Settings) -> None:
         self.network, self.target, self.sampling, self.settings = (
             network, target, sampling, settings)
         self.poses, self.prior = (network.positions, network.R_sw), target.prior()
 
     def information(self, points: FloatArray, heading: float) -> FloatArray:
         """Information (n, 7, 9, 9) of all sensors about passes through points (n, 2)."""
-        return np.asarray(pass_information(*self.poses, self.target, self.sampling, points,
-                                           heading).sum(axis=2))
+        return np.asarray(placement.pass_information(*self.poses, self.target, self.sampling,
+                                                     points, heading).sum(axis=2))
 
     def bounds(self, points: FloatArray, heading: float) -> FloatArray:
         """Bounds (n, 7, 3) of position, velocity and moment of passes through points (n, 2)."""
-        return bounds_of(self.information(points, heading), self.prior)
+        return placement.bounds_of(self.information(points, heading), self.prior)
 
     def detection(self, points: FloatArray) -> FloatArray:
         """Detection probability (n, 7) of one frame with the target at points (n, 2)."""
         detect = self.settings.detect
-        return detection_probabilities(*self.poses, self.target, self.sampling, points,
-                                       detect.false_alarm_probability, detect.background_std)
+        return placement.detection_probabilities(
+            *self.poses, self.target, self.sampling, points, detect.false_alarm_probability,
+            detect.background_std)
 
     def points(self, heading: float, offset: float, along: FloatArray) -> FloatArray:
         """Points (n, 2) [m] of a lane at the distances `along` (n,) from the centre."""
@@ -252,7 +245,6 @@ class _Passes:
         return points
 
     def lane(self, name: str, heading: float, offset: float, area: Area) -> Lane:
-        """Compute bounds and detection probabilities along one lane."""
         half_length = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
         n = int(np.clip(half_length / (self.target.speed * self.sampling.period), 10, 60))
         along = np.linspace(-half_length, half_length, 2 * n + 1)
@@ -281,14 +273,14 @@ class _Passes:
         P0 = np.diag(np.concatenate([
             prior_std**2, np.full(3, target.moment**2 / 3.0),
             np.full(3 * n_sensors, min(sampling.background_std, 1e-6)**2)]))
-        _, h, H = zip(*pass_fields(
-            *self.poses, target, Sampling(sampling.period, sampling.noise_std, half_window=0.0),
-            points, heading), strict=True)
+        instant = placement.Sampling(sampling.period, sampling.noise_std, half_window=0.0)
+        _, h, H = zip(*placement.pass_fields(*self.poses, target, instant, points, heading),
+                      strict=True)
         h, H = np.concatenate(h), np.concatenate(H)
-        std = np.empty((len(points), len(DIRECTIONS)))
+        std = np.empty((len(points), len(placement.DIRECTIONS)))
         backgrounds = np.broadcast_to(np.eye(3 * n_sensors).reshape(n_sensors, 3, -1),
                                       (len(points), n_sensors, 3, 3 * n_sensors))
-        for d in range(len(DIRECTIONS)):
+        for d in range(len(placement.DIRECTIONS)):
             variance = (np.square(sampling.noise_std) + sampling.field_error**2 * np.square(
                 h[:, d, 0]).sum(axis=-1)) / (dt / sampling.period)
             P = path_bound(F, Q, np.concatenate([H[:, d, 0], backgrounds], axis=-1),
@@ -308,10 +300,10 @@ class _Passes:
         bounds_without, bounds_with = [], []
         for heading, points in near_lanes:
             J = self.information(points, heading)
-            bounds_without.append(bounds_of(J, self.prior)[..., 0].ravel())
-            added_information = pass_information(added, np.tile(np.eye(3), (n, 1, 1)), self.target,
-                                                 sampling, points, heading)
-            bounds_with.append(bounds_of(J[:, :, None] + added_information, self.prior)[
+            bounds_without.append(placement.bounds_of(J, self.prior)[..., 0].ravel())
+            added_information = placement.pass_information(
+                added, np.tile(np.eye(3), (n, 1, 1)), self.target, sampling, points, heading)
+            bounds_with.append(placement.bounds_of(J[:, :, None] + added_information, self.prior)[
                 ..., 0].reshape(-1, n))
         return (float(np.median(np.concatenate(bounds_without))),
                 np.median(np.concatenate(bounds_with), axis=0))
@@ -322,9 +314,9 @@ class _Passes:
         `bounds_at_closest`."""
         J = self.information(lane.points[np.argmin(np.abs(lane.along))][None], lane.heading)[0]
         scale = np.repeat([max(distance_scale, 1e-3), self.target.speed, self.target.moment], 3)
-        return (observability(J[3], STATES, scale),
-                {'with prior': np.median(bounds_of(J, self.prior), axis=0),
-                 'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
+        return (observability(J[3], placement.STATES, scale),
+                {'with prior': np.median(placement.bounds_of(J, self.prior), axis=0),
+                 'without prior': np.median(placement.bounds_of(J, np.zeros((9, 9))), axis=0)})
 
     def miss_curve(self, lane: Lane, area: Area) -> FloatArray:
         """Compute `Plan.miss_curve`: `detect.onset_frames` consecutive frames must detect the

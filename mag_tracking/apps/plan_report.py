@@ -211,7 +211,6 @@ def summary_lines(p: Plan) -> list[str]:
 
 
 def _maps(plan: Plan) -> list[page.Chart]:
-    """Maps of position bound, detection probability and gain of an additional sensor."""
     f, unit = style.scale_of(np.ptp(plan.x))
     layout = page.axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
     x, y = f * plan.x, f * plan.y
@@ -255,7 +254,6 @@ def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
 
 
 def _lanes(plan: Plan) -> list[page.Chart]:
-    """Charts of position bound and detection probability along the lanes, and of missed passes."""
     f, unit = style.scale_of(np.ptp(plan.x))
     bounds, detection = [], []
     for k, (name, lane) in enumerate(_distinct_lanes(plan.lanes)):

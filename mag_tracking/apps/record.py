@@ -3,12 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from mag_tracking.messages.types import (
-    CALIBRATED_READINGS,
-    CALIBRATION_STATE,
-    NETWORK_FRAME,
-    RAW_READINGS,
-)
+from mag_tracking.messages import types
 from mag_tracking.quantities import quantity
 
 if TYPE_CHECKING:
@@ -28,11 +23,12 @@ class Selection(NamedTuple):
     """Whether to record the results of the nodes."""
     all_topics: bool = False
     """Whether to record all topics."""
-    readings: str = RAW_READINGS
+    readings: str = types.RAW_READINGS
     """Topic with the readings of many sensors."""
     result_prefixes: tuple[str, ...] = ('calibration_node/', 'detection_node/', 'tracker_node/')
     """Prefixes of result topics."""
-    result_topics: tuple[str, ...] = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
+    result_topics: tuple[str, ...] = (types.CALIBRATED_READINGS, types.CALIBRATION_STATE,
+                                      types.NETWORK_FRAME)
     """Other result topics."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':

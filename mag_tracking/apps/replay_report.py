@@ -92,7 +92,6 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
-    """Table of the background, readings, noise and position of each sensor."""
     innovations = [t['nis_by_sensor'] for t in summary['tracks']]
     rows = []
     for j, (name, s) in enumerate(summary['sensors'].items()):
@@ -115,7 +114,6 @@ def notes_of(summary: Mapping[str, Any]) -> list[Note]:
 
 
 def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on the diagnoses and the initial backgrounds."""
     for diagnosis in summary['diagnoses']:
         yield Note(WARNING if diagnosis['serious'] else NOTE, diagnosis['text'])
     for name, s in summary['sensors'].items():
@@ -126,7 +124,6 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
 
 
 def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on the limitations of the tracks, with causes."""
     counts = summary['counts']['track']
     reason = no_track_reason(counts)
     if reason:
@@ -149,7 +146,6 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
 
 
 def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Note on the number of unambiguous poses that are wrong."""
     poses = summary['unflagged_poses']
     if poses and poses['n']:
         yield Note(NOTE, f'unambiguous poses: {poses["n"]}, of which {poses["wrong"]} '
@@ -160,7 +156,6 @@ def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
 
 
 def _describe_disturbance(d: Mapping[str, Any]) -> str:
-    """Describe the duration, amplitude and extent of a disturbance in one sentence."""
     duration = (d['stamp_ns'] - d['begin_ns']) / NS
     extent = 'uniform over the network' if d['uniform'] > 0.5 else 'different at each sensor'
     return (f'disturbance {d["id"]}: {duration:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '

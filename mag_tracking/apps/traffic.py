@@ -175,6 +175,7 @@ class TrafficSink(RecordReceiver):
         self._frames: dict[int, list[FieldFrame]] = {}
         self._vehicles: list[CountedVehicle] = []
         self._summaries: list[TrafficSummary] = []
+        self.add_traffic = self._summaries.append
 
     def add_frame(self, frame: FieldFrame) -> None:
         """Store the frame of the following poses."""
@@ -190,10 +191,6 @@ class TrafficSink(RecordReceiver):
     def add_passage(self, passage: VehiclePassage) -> None:
         """Add a passage with the velocity from the delays."""
         self._vehicles.append(CountedVehicle(passage, self._delay_motion(passage.track_id)))
-
-    def add_traffic(self, summary: TrafficSummary) -> None:
-        """Add a summary."""
-        self._summaries.append(summary)
 
     def result(self, report: RunReport) -> TrafficResult:
         """Return the counted vehicles after a run."""

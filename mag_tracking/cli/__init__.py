@@ -14,7 +14,6 @@ from mag_tracking.interrupts import exit_on_signals
 from mag_tracking.nodes.start import limit_exit_time
 
 INTERRUPTED_MESSAGE = 'mag-tracking: interrupted'
-"""Message printed after Ctrl-C."""
 
 BROKEN_PIPE_STATUS = 128 + signal.SIGPIPE
 """Exit status if the reader of stdout has closed the pipe, as for other Unix commands."""
@@ -79,7 +78,6 @@ def _is_stdout_closed() -> bool:
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run a parsed command and return its exit status."""
     try:
         status: int = args.run_command(args)
         # sys.stdout is None if the process was started with a closed stdout.

@@ -16,15 +16,7 @@ from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, Pass
 from mag_tracking.apps.fit import check_cpa_range, check_orders
 from mag_tracking.apps.passes import PassFitter
 from mag_tracking.arrays import FloatArray
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_verbose,
-    distinct_names,
-    print_diagnoses,
-    recorded_network,
-)
+from mag_tracking.cli import options
 from mag_tracking.cli.tables import HEADER, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
@@ -74,12 +66,12 @@ examples:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'fit', _fit, _FIT_HELP)
+    p = options.add_command(commands, 'fit', _fit, _FIT_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_recorded_network(p)
+    options.add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--orders', nargs='+', type=int, default=ORDERS, metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
@@ -92,7 +84,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--params', type=Path, metavar='FILE',
                    help='YAML file with the settings to override')
     p.add_argument('--no-figures', action='store_true', help='do not draw figures')
-    add_verbose(p)
+    options.add_verbose(p)
 
 
 class Fits:
@@ -136,10 +128,9 @@ class Fits:
 
 
 def _fit(args: argparse.Namespace) -> int:
-    """Run `mag-tracking fit`."""
-    network = recorded_network(args)
+    network = options.recorded_network(args)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
-    distinct_names(args.recordings)
+    options.distinct_names(args.recordings)
     check_orders('--orders', args.orders)
     check_cpa_range('--cpa-range', args.cpa_range, network)
     earth = network.earth_field
@@ -161,7 +152,7 @@ def _fit(args: argparse.Namespace) -> int:
             with progress_bar(source) as bar:
                 report = run(source, pipeline, [fits.sink(source.stem, pipeline)], bar.update,
                              stopped)
-            print_diagnoses(report.diagnoses)
+            options.print_diagnoses(report.diagnoses)
             warnings += [f'{source.name}: {line}' for line in report.warnings()]
             if signals:
                 break
@@ -188,7 +179,6 @@ def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings
 
 
 def _row(fitted_pass: FittedPass) -> str:
-    """Format the row of a fitted pass, with the quantities that are trusted."""
     label = f'pass {fitted_pass.number}' + f'.{fitted_pass.vehicle}' * (fitted_pass.n_vehicles > 1)
     fit = fitted_pass.reported
     if fit is None:
@@ -247,7 +237,6 @@ def _print_details(fitted_pass: FittedPass) -> None:
 
 
 def _print_chosen(fitted_pass: FittedPass, chosen: PassFit) -> None:
-    """Print the quality and the closest approach of the chosen fit of a pass."""
     if chosen.normalised_cost > MAX_NORMALISED_COST:
         print(f'  poor fit (cost {chosen.normalised_cost:.1f}): errors of speed and position may '
               'be several standard deviations')
@@ -271,7 +260,6 @@ def _trusted_values(fit: PassFit) -> str:
 
 
 def _formatted_estimates(fit: PassFit) -> str:
-    """Format the estimates of a fit, with standard deviations in parentheses."""
     sd = np.sqrt(np.diagonal(fit.position_covariance))
     position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
@@ -282,7 +270,6 @@ def _formatted_estimates(fit: PassFit) -> str:
 
 
 def _with_std(estimate: Iterable[float], digits: int) -> str:
-    """Format a value and its standard deviation."""
     value, std = estimate
     return f'{value:.{digits}f}({std:.{digits}f})'
 
@@ -343,7 +330,6 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, fit: PassFit, out: Path) -> None:
-    """Draw the fit of a pass."""
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import pass_figure
     from mag_tracking.report.style import save_figure

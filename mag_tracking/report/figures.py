@@ -30,7 +30,6 @@ def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) ->
 
 
 def _colours(log: TrackLog) -> dict[str, str]:
-    """Assign a colour to each arrival direction, in alphabetical order."""
     names = sorted({name for row in log.arrivals for name in row})
     return {name: style.series_colour(i) for i, name in enumerate(names)}
 

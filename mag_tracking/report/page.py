@@ -22,9 +22,7 @@ from mag_tracking.report.style import series_colour
 SCRIPTS = ('scene', 'map', 'body', 'overview', 'curves', 'tables', 'live', 'main', 'start')
 """Script files, in loading order."""
 ERROR, WARNING, NOTE = 'error', 'warning', 'note'
-"""Severities of a note."""
 DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
-"""Dash styles, one for each colour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,6 @@ class Chart:
 
     title: str
     traces: Sequence[Mapping[str, Any]]
-    """Plotly traces."""
     layout: Mapping[str, Any]
 
 

@@ -14,7 +14,6 @@ from mag_tracking.report.style import BLUE, VERMILLION, literal
 from mag_tracking.units import NS
 
 N_VEHICLES = 5
-"""Number of poses at which the vehicle is drawn."""
 ELLIPSE_M = 0.7
 """Minimum distance between the 90 % regions that are drawn [m]."""
 WIDTH_IN, MAX_HEIGHT_IN, LEGEND_IN = 10.0, 6.0, 0.5
@@ -127,7 +126,6 @@ def _shapes(log: TrackLog, k: int) -> list[FloatArray]:
 
 
 def _draw_vehicles(axes: Axes, log: TrackLog, shown: IntArray, sensors: FloatArray) -> None:
-    """Draw the vehicle at the given poses, with the time since the first of them."""
     for rank, k in enumerate(shown):
         alpha = 0.35 + 0.65 * rank / max(1, len(shown) - 1)
         body, *windows = _shapes(log, k)

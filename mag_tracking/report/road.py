@@ -12,7 +12,6 @@ from mag_tracking.arrays import BoolArray, FloatArray
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
 LANE_WIDTH_M = 3.5
-"""Width of a lane [m]."""
 SHOULDER_M = 1.0
 """Distance of the edge of the road from a sensor beside it [m]."""
 MAX_ANGLE = np.radians(15.0)
@@ -146,6 +145,5 @@ def _outline(part: FloatArray) -> FloatArray:
 
 
 def _unit(v: FloatArray) -> FloatArray:
-    """Unit vector in the direction of `v` (2,)."""
     unit: FloatArray = v / np.hypot(*v)
     return unit

@@ -17,7 +17,6 @@ BLUE, VERMILLION, GREEN, ORANGE, PINK, SKY = (
 SERIES_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY)
 """Colours of curves, in order; vermillion is reserved for smoothed tracks."""
 AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
-"""Colours of the axes x, y, z."""
 MINOR_LABEL_DECADES = 1.5
 """Range of a logarithmic axis [decades] up to which values between powers of ten are labelled."""
 DOTS_PER_INCH = 110

@@ -205,12 +205,10 @@ class LiveScene:
             return out
 
     def _n_sent_frames(self) -> int:
-        """Number of stored frames that have been sent."""
         return max(0, len(self._frames) - self._n_new_frames)
 
     def _rows_message(self, tracks: list[dict[str, Any]], smoothed: list[dict[str, Any] | None],
                       frames: list[FieldFrame]) -> str:
-        """JSON message with rows of tracks, smoothed paths, and frames."""
         begin_ns = self._begin_ns or 0
         return json_text({
             'type': 'rows', 'tracks': tracks, 'smoothed': smoothed,
@@ -228,7 +226,6 @@ class LiveScene:
                            'scene': scene})]
 
     def _health_message(self) -> str:
-        """JSON message with the notes and tables of the page."""
         return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                           'tables': [asdict(table) for table in self._tables]})
 

@@ -37,7 +37,6 @@ LAG_TIMEOUT_S = 20.0
 MAX_VIEWERS = 100
 MAX_PORT = 65535
 STOP_TIMEOUT_S = 10.0
-"""[s] Maximum time to wait for the end of the server thread."""
 PAGE, STREAM = '/', '/stream'
 LOG = getLogger('mag_tracking.web')
 
@@ -182,7 +181,6 @@ class PageServer:
         self._viewers[viewer] = _buffered_bytes(viewer) + MAX_BUFFERED
 
     async def _handle_viewer(self, viewer: ServerConnection) -> None:
-        """Handle one connection until it closes; incoming messages are ignored."""
         if len(self._viewers) + len(self._lagging) >= MAX_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
@@ -285,7 +283,6 @@ def _is_origin(parts: SplitResult | None) -> bool:
 
 
 def _buffered_bytes(viewer: ServerConnection) -> int:
-    """Size of a viewer's send buffer [bytes]."""
     return viewer.transport.get_write_buffer_size()
 
 
@@ -306,7 +303,6 @@ def _open_socket(host: str, port: int) -> socket.socket:
 
 def _response(status: HTTPStatus, body: bytes, media_type: str = 'text/plain',
               encoding: str = '') -> Response:
-    """HTTP response with security headers."""
     headers = Headers({
         'Content-Type': f'{media_type}; charset=utf-8', 'Content-Length': str(len(body)),
         'Cache-Control': 'no-store', 'Referrer-Policy': 'no-referrer', 'Connection': 'close',
