@@ -74,11 +74,8 @@ and 3 rad/s), or a magnet that is moved step by step on a bench."""
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
-    """Settings for a target, a key of `TARGET_DEFAULTS`, with changes by dotted name.
-
-    Raises SettingsError if `target` is unknown, if a change is invalid, or if the change of
-    `track.target` differs from the target.
-    """
+    """Settings for a key of `TARGET_DEFAULTS` with changes by dotted name; raises SettingsError if
+    one is invalid, or changes `track.target` to another."""
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
     defaults, changes = TARGET_DEFAULTS[target], dict(changes or {})
@@ -118,10 +115,7 @@ class Pipeline:
             self.traffic = Traffic(network, settings.traffic, settings.track.target == 'vehicle')
 
     def feed(self, readings: Readings) -> list[Output]:
-        """Process raw readings; return the resulting records in order of processing.
-
-        The records do not depend on how the readings are split into batches.
-        """
+        """Process raw readings, in batches of any size; return the resulting records in order."""
         return self._process_calibrated(self.calibrate.feed(readings))
 
     def flush(self) -> list[Output]:

@@ -45,10 +45,7 @@ _PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
 
 @dataclasses.dataclass(frozen=True)
 class FrameChunk:
-    """Attributes of n consecutive frames, stacked, and the passes that ended during these frames.
-
-    `doubts` are {index of a frame: doubtful times that apply from this frame on}.
-    """
+    """Attributes of n frames, stacked; passes that ended then; {index: doubts from a frame on}."""
 
     stamp_ns: IntArray
     field: FloatArray
@@ -62,8 +59,7 @@ class FrameChunk:
     passes: tuple[NumberedPass, ...]
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
-        """Iterate over the frames, each with the doubtful times, or None if they have not
-        changed."""
+        """Iterate over the frames, each with the doubtful times, or None if they are unchanged."""
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
@@ -113,11 +109,8 @@ def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
 
 
 class SegmentWriter:
-    """Writes each segment of a recording to a separate folder, using bounded memory.
-
-    The folders are `segment-0`, ..., each with the chunks `0.npz`, ... `lookback_s` is the time
-    span of the earlier frames that a new track uses.
-    """
+    """Writes segments to the folders `segment-0`, ..., each with the chunks `0.npz`, ...;
+    `lookback_s` is the time span of the earlier frames that a new track uses."""
 
     def __init__(self, folder: Path, lookback_s: float) -> None:
         self._folder = folder
@@ -135,9 +128,8 @@ class SegmentWriter:
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
         """Add the next frame, with the doubtful times of each sensor as known then.
 
-        A segment with at least `MIN_SEGMENT_FRAMES` frames ends after an interval without a target
-        that is longer than `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back
-        while no target is present.
+        A segment with `MIN_SEGMENT_FRAMES` ends after an interval without a target longer than
+        `lookback_s` and `MIN_QUIET_S`, any segment if the time jumps back without a target.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1

@@ -144,8 +144,7 @@ class _Segmenter:
             self._writer.add_pass(self._n_passes, data, notes)
 
     def _add_due_health(self, stamp_ns: int) -> None:
-        """Write the health rows `HEALTH_INTERVAL_S` after the previous ones, or after the first
-        frame or a time jump."""
+        """Write the health rows that are due after a frame, also after a time jump."""
         interval_ns = int(HEALTH_INTERVAL_S * NS)
         if self._next_health_ns is None or stamp_ns < self._next_health_ns - interval_ns:
             self._next_health_ns = stamp_ns + interval_ns

@@ -56,9 +56,8 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
               stopped: Callable[[], bool] | None = None) -> Calibration:
     """Estimate orientations, clock offsets (from knocks) and noise of a network from a recording.
 
-    The recording must start without a target near the sensors. `passes` refines the nominal
-    orientations with passing targets, which reads the recording twice; it is omitted if
-    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field. Raises
+    `passes` refines the orientations with passing targets in a second pass over the recording,
+    unless `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field. Raises
     RecordingError if the recording has no samples of the network.
     """
     levels, survey, stage, interrupted = _survey_recording(
@@ -136,11 +135,10 @@ def tumble(source: Source, network: SensorNetwork, sensors: Collection[str], dat
            field_magnitude: float | None = None, progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray]]:
-    """Estimate the hard and soft iron of sensors that were rotated during a recording.
+    """Estimate the hard and soft iron of `sensors` (default: all) that were rotated.
 
-    No `sensors` selects all. Without `field_magnitude` [T] of the ambient field, the mean gain of a
-    sensor is not calibrated. The results are the network with the corrections of the sensors whose
-    fit converged, the fits, and the readings (n, 3) [T, sensor frame].
+    Without `field_magnitude` [T], the mean gain is not calibrated. The results are the network with
+    the corrections that converged, the fits, and the readings (n, 3) [T, sensor frame].
     """
     rows = {name: network.index(name) for name in tuple(sensors) or network.names}
     collected: dict[str, list[FloatArray]] = {name: [np.empty((0, 3))] for name in rows}
@@ -224,12 +222,10 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
                     noise_std: float | None = None) -> GeometrySurvey:
     """Estimate the geometry of a network from its readings for many poses of a magnet.
 
-    The sensors of the nominal network are in the order of the columns of `table`
-    (`read_pose_table`); its offsets and corrections are applied. `moment` is in A m². With the
-    corners `box` (low, high) [m] around the magnet, the poses are estimated, and the table needs
-    only readings. `noise_std` [T], by default `ASSUMED_NOISE`, is that of sensors without a
-    configured noise and is stored only if given. Raises RecordingError if the table does not match
-    the network or does not suffice.
+    The sensors are in the order of the columns of `table`; `moment` is in A m². With the corners
+    `box` (low, high) [m] around the magnet, the poses are estimated. `noise_std` [T], by default
+    `ASSUMED_NOISE`, is that of sensors without a configured noise; it is stored only if given.
+    Raises RecordingError if the table does not match the network or does not suffice.
     """
     if box is None:
         readings, positions, axes = read_pose_table(table)
@@ -274,8 +270,7 @@ def _with_noise(network: SensorNetwork, noise_std: float) -> SensorNetwork:
 
 
 def _corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
-    """Apply the offsets and corrections of a network to readings (K, n, 3), as the stage
-    Calibrate."""
+    """Apply offsets and corrections to readings (K, n, 3), as the stage Calibrate."""
     field = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
         if offset is not None:

@@ -45,10 +45,7 @@ def write_report(calibration: Calibration, nominal: SensorNetwork, name: str, pa
 
 
 def _knocks(calibration: Calibration) -> list[tuple[str, list[Curve]]]:
-    """Acceleration around the first knock by uncorrected and by corrected clocks: (title, curves).
-
-    A curve is the name of a sensor, its times [s] and its accelerations [m/s²].
-    """
+    """First knock by uncorrected and by corrected clocks: (title, [(sensor, s, m/s²)])."""
     shocks = dict(list(calibration.survey.shocks.items())[:MAX_KNOCKS])
     first = min((float(t[s > KNOCK_START * s.max()][0]) for t, s in shocks.values()
                  if len(s) and s.max() > 0.0), default=0.0)
@@ -112,10 +109,7 @@ def _table(calibration: Calibration) -> page.Table:
 
 
 def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figure:
-    """Plot the knocks before and after the clock correction, and the yaw of the sensors.
-
-    `nominal` is the network with the orientations of the network file.
-    """
+    """Plot the knocks before and after the clock correction, and the yaw relative to `nominal`."""
     figure = Figure(figsize=(11.0, 4.6), layout='constrained')
     *left, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     for axes, (title, curves) in zip(left, _knocks(calibration), strict=True):
@@ -141,10 +135,7 @@ def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figu
 
 
 def tumble_figure(fits: Mapping[str, EllipsoidFit], readings: Mapping[str, FloatArray]) -> Figure:
-    """Plot a tumble calibration: magnitudes before and after correction, and field directions.
-
-    `readings` (n, 3) are chronological.
-    """
+    """Plot magnitudes before and after correction of `readings` (n, 3), and field directions."""
     figure = Figure(figsize=(10.0, 0.6 + 2.7 * len(fits)), layout='constrained')
     rows = figure.subplots(len(fits), 2, squeeze=False, width_ratios=(1.5, 1.0))
     for (left, right), (name, fit) in zip(rows, fits.items(), strict=True):

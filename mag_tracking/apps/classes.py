@@ -21,11 +21,8 @@ from mag_tracking.run import RecordingSource, run
 
 @dataclass(frozen=True)
 class Examples:
-    """Features (n, n_features) of signatures, their origins, and the axes and unit of all of them.
-
-    Labels are empty if unlabelled; signatures of the same target have equal `groups`. There is one
-    message in `unusable` per signature for which no features could be computed.
-    """
+    """Features (n, n_features) of signatures; those of the same target have equal `groups`, and
+    `unusable` has a message for each signature without features."""
 
     x: FloatArray
     labels: tuple[str, ...]
@@ -37,8 +34,7 @@ class Examples:
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
-    """Compute the features of signatures; raises LabelsError if none is usable or axes or units
-    differ."""
+    """Compute features; raises LabelsError if no signature is usable, or axes or units differ."""
     if not signatures:
         raise LabelsError('the input contains no signatures')
     x, rows, reasons = classifier.feature_table(signatures)
@@ -52,11 +48,8 @@ def examples_of(signatures: list[Signature]) -> Examples:
 def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
                         network: SensorNetwork | None = None, is_labelled: bool = True
                         ) -> list[Signature]:
-    """Read the signatures in a table, or extract them from labelled intervals of a recording.
-
-    A recording requires `labels`, a CSV table of the intervals, and `network`. Raises LabelsError
-    if either is missing, a label is empty, intervals overlap, or an interval contains no readings.
-    """
+    """Read the signatures in a table, or extract them from the intervals in the table `labels` of a
+    recording; raises LabelsError if inputs are missing, contradictory or without readings."""
     if Path(path).suffix.lower() == '.csv' and labels is None:
         return signature_tables.read_signatures(path, is_labelled)
     if labels is None or network is None:
@@ -112,11 +105,8 @@ def evaluate_classes(examples: Examples, model: classifier.SignatureModel | None
                      n_splits: int = 20,
                      progress: Callable[[Iterable[int]], Iterable[int]] = iter
                      ) -> classifier.Evaluation:
-    """Evaluate a trained model, or models trained on `n_splits` stratified splits.
-
-    `progress` wraps the iterable of splits, as `tqdm` does. Raises LabelsError if there are too few
-    examples, or the model has different axes or classes.
-    """
+    """Evaluate a trained model, or models trained on `n_splits` stratified splits; raises
+    LabelsError if there are too few examples, or the model has different axes or classes."""
     if model is None:
         return classifier.evaluate_splits(examples.x, examples.labels, examples.groups,
                                           examples.axes, examples.unit, n_splits, progress=progress)

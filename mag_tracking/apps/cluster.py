@@ -48,11 +48,8 @@ class _Task(NamedTuple):
 
 
 class Cluster(Generic[_Key]):
-    """Runs tasks on `workers` processes of this machine, or on the Dask scheduler at an address.
-
-    On exit, unfinished tasks are cancelled. Certificates for tls:// are those of the configuration
-    of Dask (`TLS_VARIABLES`). `n_lost` counts lost workers. Raises ClusterError if the workers do
-    not start, or the scheduler does not respond or has none.
+    """Runs tasks on `workers` processes of this machine, or on the Dask scheduler at an address;
+    raises ClusterError if the workers do not start, or the scheduler does not respond or has none.
     """
 
     def __init__(self, workers: int, scheduler: str | None) -> None:
@@ -107,8 +104,7 @@ class Cluster(Generic[_Key]):
                                           priority=task.priority)] = task
 
     def finished(self) -> Iterator[tuple[_Key, Any]]:
-        """Wait up to `POLL_S` for tasks; yield the key and the result or exception of each finished
-        one.
+        """Wait up to `POLL_S`; yield the keys and the results or exceptions of finished tasks.
 
         Raises ClusterError if the scheduler is lost, or there have been no workers for too long.
         """

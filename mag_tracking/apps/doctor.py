@@ -92,8 +92,7 @@ class HostStalls:
 
 def load_findings(found: Collection[Finding], sensors: Collection[str], load: float,
                   n_processors: int) -> Iterator[Finding]:
-    """Report a `load` (processes that run or wait) above the number of processors if readings of
-    all sensors are late or lost."""
+    """Report a `load` above the number of processors if all sensors are late or lose readings."""
     late = {f.subject for f in found if f.cause in TIME_CAUSES}
     if load > n_processors and sensors and late.issuperset(sensors):
         yield Finding(False, 'computer', f'{load:.1f} processes compete for '
@@ -201,8 +200,7 @@ class Doctor:
 def examine(source: RecordingSource, network: SensorNetwork, settings: Settings,
             progress: Progress | None = None, stopped: Callable[[], bool] | None = None
             ) -> tuple[Doctor, list[Finding]]:
-    """Diagnose a network from a recording that is read by message; return the doctor, and findings
-    about the recording, which it lacks."""
+    """Diagnose a network from a recording; return the doctor, and findings about the recording."""
     doctor = Doctor(Pipeline(network, settings, 'calibrate'))
     run(source, doctor.pipeline, [doctor], progress, stopped)
     return doctor, findings.source_findings(source.name, source.lost, source.rejected)

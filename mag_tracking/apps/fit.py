@@ -131,8 +131,7 @@ def check_orders(name: str, orders: Sequence[int]) -> None:
 
 
 def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
-    """Raise SettingsError unless (range, std) [m] are positive and the network has a single
-    sensor."""
+    """Raise SettingsError unless (range, std) [m] are positive and there is a single sensor."""
     if cpa_range is None:
         return
     if len(network) > 1:

@@ -25,12 +25,10 @@ N_POSES = 120
 
 
 def pass_figure(fit: PassFit, title: str) -> Figure:
-    """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
+    """Plot the measured and the fitted field, with 90 % bands, as [TSP14]_ Fig. 6.
 
-    The bands account for the noise and for the uncertainty of the fitted parameters
-    (`PassFit.robust_covariance`). A normalised cost above 1 scales the noise variance, to account
-    for model errors. Only the `MAX_SENSORS` with the strongest fields are plotted. As [TSP14]_ Fig.
-    6.
+    The bands account for the noise and for the uncertainty of the parameters; a normalised cost
+    above 1 scales the noise variance. The `MAX_SENSORS` with the strongest fields are plotted.
     """
     data = fit.data
     background = fit.predicted - _target_field(fit)
@@ -77,11 +75,7 @@ def _target_field(fit: PassFit) -> FloatArray:
 
 
 def order_figure(passes: Sequence[FittedPass]) -> Figure:
-    """Plot the normalised cost against the number of dipoles, one line per pass, as [TSP14]_ Fig.
-    7.
-
-    A filled symbol marks the chosen number of dipoles.
-    """
+    """Plot the normalised cost by number of dipoles, as [TSP14]_ Fig. 7; the chosen is filled."""
     figure = Figure(figsize=(7.5, 5.0), layout='constrained')
     axes = figure.add_subplot()
     for k, one in enumerate(passes):

@@ -53,8 +53,7 @@ class Timing:
         self._sums: FloatArray = np.zeros(64 * _BINS_PER_OCTAVE)
 
     def add(self, times_ns: IntArray, log_times_ns: IntArray) -> None:
-        """Add messages in the order of the recording, by timestamp, or by log time if all stamps
-        are 0."""
+        """Add messages in the order of the recording, by log time if all timestamps are 0."""
         if not len(times_ns):
             return
         self.n_messages += len(times_ns)
@@ -127,11 +126,8 @@ class Timing:
 
 def time_topics(recording: Recording, progress: Callable[[int], object] | None = None
                 ) -> tuple[dict[Source, Timing], 'Counter[str]', 'Counter[str]']:
-    """Compute the statistics of the times of all topics, in order of appearance.
-
-    Sensors that share a topic are separate. The counters are the readings that cannot be decoded,
-    by cause, and the messages that were read, by topic.
-    """
+    """Compute the timing of each topic and sensor; count undecodable readings by cause, and
+    messages by topic."""
     timings: dict[Source, Timing] = {}
     faults: Counter[str] = Counter()
     counts: Counter[str] = Counter()

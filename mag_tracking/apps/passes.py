@@ -37,10 +37,7 @@ Pass: TypeAlias = tuple[PassData, tuple[str, ...]]
 
 
 class PassCollector:
-    """Extracts passes from the steps of a run.
-
-    A pass contains all measurements from `PAD_S` before the onset of a detection to its release.
-    """
+    """Extracts passes, from `PAD_S` before the onset of a detection to its release, from steps."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._network, self._calibrate = pipeline.network, pipeline.calibrate
@@ -145,12 +142,8 @@ class PassCollector:
 
 
 def _common_covariance(covariances: FloatArray) -> FloatArray:
-    """Replace the covariances (n, 3, 3) of readings by the first one if they are similar.
-
-    While the noise is being learnt, its estimate varies slightly although the noise is constant.
-    The covariances of a coarse sensor differ: they are much larger in a constant field than in a
-    changing one.
-    """
+    """Replace covariances (n, 3, 3) by the first one if they vary only because the noise is being
+    learnt; those of a coarse sensor differ much."""
     traces = np.nansum(np.einsum('kii->ki', covariances), axis=1)
     if traces.max() > 2.0 * traces.min():
         return covariances
@@ -196,12 +189,11 @@ class PassTracks:
                     float(np.trace(record.covariance[:3, :3]))))
 
     def paths(self, data: PassData) -> FloatArray:
-        """Position and velocity (K, 6) [m, m/s, world frame] of each vehicle in a pass when
-        `data.t` is zero.
+        """Position and velocity (K, 6) [m, m/s] of each vehicle in a pass when `data.t` is zero.
 
         A vehicle belongs to the pass that contains its pose of smallest variance. Overlapping
-        tracks belong to one vehicle that was lost and found again; the track with the smallest
-        variance is used. Passes must come in chronological order. There are no paths for magnets.
+        tracks are of one vehicle, found again; the one of smallest variance is used. Passes must be
+        in order.
         """
         end_ns = data.stamp_ns + int(NS * data.t.max())
         candidates = sorted((pose for pose in self._poses_of_smallest_variance(end_ns)
@@ -214,12 +206,8 @@ class PassTracks:
         return np.array(paths).reshape(-1, 6)
 
     def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
-        """Take the pose with the smallest variance up to `end_ns` [ns] of each track; drop the
-        others.
-
-        Vehicles that are still approaching are omitted: their latest pose has the smallest
-        variance.
-        """
+        """Take the pose with the smallest variance up to `end_ns` of each track, and drop the
+        others; the latest pose has it while a vehicle approaches, which is omitted."""
         selected = []
         for track, poses in list(self._poses.items()):
             earlier = [pose for pose in poses if pose.stamp_ns <= end_ns]
@@ -245,11 +233,8 @@ def ground_prior(settings: TrackSettings) -> GroundPrior:
 
 
 class PassFitter:
-    """Sink that fits every pass as a row of dipoles, for each number of dipoles in `orders`.
-
-    The tracks determine the number of vehicles in each pass. Each result is passed to `report`.
-    `cpa_range` is (range, std) at the closest point of approach [m], only for a single sensor.
-    """
+    """Sink that fits every pass with each number of dipoles in `orders` and passes the results to
+    `report`; `cpa_range` is (range, std) [m] at the closest point of a single sensor."""
 
     def __init__(self, recording: str, pipeline: Pipeline, orders: Sequence[int],
                  cpa_range: tuple[float, float] | None, report: Callable[[FittedPass], object],
@@ -288,9 +273,8 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single_fits: Se
                     stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
     """Fit the vehicles in detection `number` (from 1), jointly if there are several.
 
-    `single_fits` are the fits as a single vehicle; `paths` (K, 6) [m, m/s, world frame] are the
-    positions and velocities of the tracked vehicles when `data.t` is zero; `orders` are the numbers
-    of dipoles for several vehicles. The result is invalid after `stopped` has returned true.
+    `paths` (K, 6) [m, m/s] are those of the tracked vehicles when `data.t` is zero; `orders` are
+    for several vehicles. The result is invalid after `stopped` has returned true.
     """
     vehicles = fit_targets(data, single_fits, paths, ground, orders, stopped)
     if len(vehicles) == 1:

@@ -161,11 +161,8 @@ def compute_plan(network: SensorNetwork, target: placement.PlannedTarget,
                  settings: Settings,
                  clearance: float = 0.0, n_grid: int = 41,
                  progress: Callable[[int], object] | None = None) -> Plan:
-    """Compute bounds, detection probabilities and the best position of an additional sensor.
-
-    `clearance` [m] is its minimum distance from a lane, and `n_grid` the number of points along the
-    longer side of the maps. `progress` is called with 1 for each of the `n_parts` parts.
-    """
+    """Compute a plan; `clearance` [m] is the distance of an additional sensor from a lane, and
+    `progress` is called with 1 for each of the `n_parts`."""
     report_part = progress or (lambda n: None)
     passes = _Passes(network, target, sampling, settings)
     x, y, points = _grid(area, n_grid)
@@ -203,8 +200,7 @@ def _lane_distances(lane: Lane, points: FloatArray) -> FloatArray:
 
 
 def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coordinates (nx,), (ny,) and points (ny nx, 2) of a map with square cells and `n` points
-    along the longer side."""
+    """Coordinates (nx,), (ny,) and points (ny nx, 2) of a map with square cells."""
     x0, y0, x1, y1 = area
     cell = max(x1 - x0, y1 - y0) / (n - 1)
     x, y = (np.linspace(low, high, max(2, int(round((high - low) / cell)) + 1), dtype=float)
@@ -253,12 +249,9 @@ class _Passes:
                     self._filter_bound(points, heading), self.detection(points).mean(axis=1))
 
     def _filter_bound(self, points: FloatArray, heading: float) -> FloatArray:
-        """Position bound (n,) [m] at each point of a lane of a filter that starts at the first
-        point.
-
-        The filter uses the motion model of the tracker and estimates the backgrounds. The bound is
-        the median over the directions of the moment.
-        """
+        """Position bound (n,) [m] on a lane of a filter that starts at its first point, with the
+        motion model of the tracker and unknown backgrounds; median over the directions of the
+        moment."""
         target, sampling, n_sensors = self.target, self.sampling, len(self.network)
         dt = np.hypot(*(points[1] - points[0])) / target.speed
         n_x = 9 + 3 * n_sensors
@@ -310,8 +303,7 @@ class _Passes:
 
     def closest_point(self, lane: Lane, distance_scale: float
                       ) -> tuple[Observability, dict[str, FloatArray]]:
-        """Compute `Plan.observability`, in units of `distance_scale` [m], and
-        `bounds_at_closest`."""
+        """Compute `Plan.observability`, scaled by `distance_scale` [m], and `bounds_at_closest`."""
         J = self.information(lane.points[np.argmin(np.abs(lane.along))][None], lane.heading)[0]
         scale = np.repeat([max(distance_scale, 1e-3), self.target.speed, self.target.moment], 3)
         return (observability(J[3], placement.STATES, scale),
@@ -319,8 +311,7 @@ class _Passes:
                  'without prior': np.median(placement.bounds_of(J, np.zeros((9, 9))), axis=0)})
 
     def miss_curve(self, lane: Lane, area: Area) -> FloatArray:
-        """Compute `Plan.miss_curve`: `detect.onset_frames` consecutive frames must detect the
-        target."""
+        """Compute `Plan.miss_curve`: `detect.onset_frames` consecutive frames must detect."""
         half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
         n = int(np.clip(4.0 * half_length / (self.target.speed * self.sampling.period), 1,
                         MAX_FRAMES))

@@ -52,10 +52,7 @@ def detection_figure(plan: Plan) -> Figure:
 
 
 def sensor_figure(plan: Plan) -> Figure:
-    """Map of the reduction [%] of the median position bound by an additional sensor at each point.
-
-    The map is white where no sensor is allowed.
-    """
+    """Map of the reduction [%] of the bound by an additional sensor; white if not allowed."""
     figure, axes, f, unit = _draw_map(
         plan, 'Improvement by one additional sensor\n(median bound near the sensors without it: '
         f'{length_text(plan.std_without_added_sensor)})')
@@ -138,10 +135,7 @@ def length_text(metres: float) -> str:
 
 
 def _distinct_lanes(lanes: Sequence[Lane]) -> list[tuple[str, Lane]]:
-    """Group lanes with identical curves, which would overlap in a plot.
-
-    Return the combined names of each group, and its first lane.
-    """
+    """Group lanes with identical curves: their combined names, and the first lane."""
     out: list[tuple[list[str], Lane]] = []
     for lane in lanes:
         for names, other in out:

@@ -174,10 +174,7 @@ def _with_nan(values: ArrayLike) -> NDArray[Any]:
 
 
 def _checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
-    """Check readings and convert them to the array types that the stages expect.
-
-    Raises ReadingsError if shapes or types are wrong, or no reading belongs to the network.
-    """
+    """Convert readings to the types of the stages; raises ReadingsError if none is usable."""
     readings = _to_standard_types(readings)
     if len(readings) and not set(readings.names) & set(network.names):
         raise ReadingsError(f'no reading is from a sensor of the network: the readings are from '

@@ -62,12 +62,10 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            more_sinks: Callable[[Pipeline], Sequence[Sink]] = lambda pipeline: ()) -> Run:
     """Track the targets in a recording and write the results to the folder `out`.
 
-    `progress` is called with the number of bytes read since the last call. `stopped` is called
-    after every batch of readings and every progress report; when it returns true, partial results
-    are written and the summary is marked as interrupted. `report` is called with a message if the
-    results of an earlier run are replaced. `truth` is a CSV file (`recording.truth`), or a topic
-    with messages of type PoseStamped, PoseWithCovarianceStamped or Odometry, by default all topics
-    below /ground_truth. `more_sinks` is called with the pipeline and returns more sinks of the run.
+    `progress`, `stopped`: see `run`; the summary of a stopped run is marked as interrupted.
+    `report` is called if results of an earlier run are replaced. `truth` is a CSV file, or a topic
+    of poses or odometry, by default all below /ground_truth. `more_sinks` are created from the
+    pipeline.
 
     Raises RecordingError if the recording has none of the network's topics or the ground truth
     cannot be read, OutputError if `out` is the folder of the recording.
@@ -203,11 +201,8 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
 
 def errors_against_truth(log: TrackLog | SmoothedLog, network: SensorNetwork, settings: Settings,
                          truth: Mapping[str, track_errors.Truth]) -> dict[str, Any] | None:
-    """Errors of a track relative to the best-matching target of the ground truth.
-
-    The result is the entry `truth` of the track in `summary.json`; None if no ground truth covers
-    it.
-    """
+    """Entry `truth` of a track in `summary.json`: errors relative to the best-matching target; None
+    if no ground truth covers the track."""
     found: list[tuple[float, dict[str, Any]]] = []
     for name, true in truth.items():
         if settings.track.target == 'magnet':

@@ -161,10 +161,8 @@ def check_vehicles(settings: Settings) -> None:
 
 
 class TrafficSink(RecordReceiver):
-    """Collects passages and summaries; stores the frames of tracks to compute the delays.
-
-    Raises SettingsError if the target is not a vehicle.
-    """
+    """Collects passages and summaries, and the frames of tracks for the delays; raises
+    SettingsError if the target is not a vehicle."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         check_vehicles(pipeline.settings)
@@ -222,8 +220,7 @@ class TrafficSink(RecordReceiver):
 
 
 def earth_field_strength(network: SensorNetwork) -> FloatArray:
-    """Magnetic field strength (3,) of the Earth [A/m], world frame; raises NetworkError if
-    unknown."""
+    """Field strength (3,) of the Earth [A/m], world frame; raises NetworkError if unknown."""
     if network.earth_field is None or not network.earth_field.any():
         raise NetworkError('hard and soft iron cannot be separated without the field of the Earth: '
                            'add earth_field to the network file')

@@ -30,11 +30,8 @@ def command() -> NoReturn:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with `argv`, by default `sys.argv[1:]`, and return its exit status.
-
-    It is 0 for success, 1 for an error that has been printed, 130 after Ctrl-C. Some commands
-    return other values, which their help texts describe.
-    """
+    """Run the command with `argv`, by default `sys.argv[1:]`; return its exit status: 0 for
+    success, 1 for an error that has been printed, 130 after Ctrl-C, others as in the help text."""
     arguments = sys.argv[1:] if argv is None else argv
     for argument in arguments:
         # Paths cannot contain NUL, but functions that take a path report this in different ways.

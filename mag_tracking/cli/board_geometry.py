@@ -103,8 +103,7 @@ def _geometry(args: argparse.Namespace) -> int:
 
 
 def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Return the corners of the box, or None without --unknown-poses; raises SettingsError,
-    OutputError for any invalid option."""
+    """Return the corners of the box, None without --unknown-poses; check all options."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
         raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '

@@ -70,10 +70,7 @@ RENAMED = {
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse a command line without the program name.
-
-    `run_command` of the namespace takes the namespace and returns the exit status.
-    """
+    """Parse a command line without the program name; `run_command` returns the exit status."""
     parser = argparse.ArgumentParser(
         prog='mag-tracking', usage='%(prog)s [--help] [--version] COMMAND ...',
         description='Track magnetic targets with stationary magnetometers.', epilog=_overview(),

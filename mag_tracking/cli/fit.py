@@ -317,10 +317,7 @@ def _iron(passes: Sequence[FittedPass], earth_field: FloatArray) -> dict[str, An
 
 
 def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
-    """Find reasons not to use an estimate of hard and soft iron from the moments of `n_passes`.
-
-    `soft_std` [m³] is the std of the soft iron, inflated if the normalised cost exceeds 1.
-    """
+    """Find reasons not to use an estimate of hard and soft iron, with its inflated std [m³]."""
     degrees_of_freedom = 3 * n_passes - 4
     if iron.normalised_cost * degrees_of_freedom > energy_threshold(P_WARNING, degrees_of_freedom):
         yield ('the moments contradict each other; the passes may be of different vehicles, or one '

@@ -104,10 +104,7 @@ def _run(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
-    """Run the live page in a separate process, so that it cannot delay the nodes.
-
-    The first of the ROS arguments is `--ros-args`. Raises DeviceError if the port cannot be opened.
-    """
+    """Run the live page in a process that cannot delay the nodes; raises DeviceError."""
     check_port(host, port)
     # The page process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([

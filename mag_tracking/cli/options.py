@@ -29,10 +29,7 @@ FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
-    """Add the parser of a command or subcommand; `name` is a key in `COMMANDS`.
-
-    `run` returns the exit status. `text`, with examples, is printed after the options.
-    """
+    """Add the parser of the command `name` in `COMMANDS`; `text` is printed after its options."""
     summary = COMMANDS[name].summary
     parser = commands.add_parser(
         name.rpartition(' ')[2], help=summary, description=summary, epilog=text,
@@ -64,8 +61,7 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Names without extension under which the results of the recordings are stored; raises
-    OutputError if two are equal."""
+    """Names of results without extension; raises OutputError if two recordings share one."""
     names = [path.resolve().stem for path in paths]
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
@@ -113,8 +109,7 @@ def check_writable(path: Path | None) -> None:
 
 
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
-    """Raise OutputError if the report cannot be written, does not end in .html or .htm, or would
-    replace one of `others`."""
+    """Raise OutputError if --report cannot be written, is not HTML, or would replace `others`."""
     path = args.report
     if path is None:
         return
@@ -154,10 +149,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def settings_of(args: argparse.Namespace, network: SensorNetwork) -> 'Settings':
-    """Settings of --target and --params; raises SettingsError if the parameter file is invalid.
-
-    Without both, a board of sensors selects a magnet, and a line is printed.
-    """
+    """Settings of --target and --params, by default for a magnet if the sensors form a board."""
     from mag_tracking.pipeline import settings_for
 
     changes = read_parameter_file(args.params) if args.params else {}
@@ -205,8 +197,7 @@ def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> N
 
 
 def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'TableOptions':
-    """Collect the options of `add_table_options`, with the name `sensor` of the only sensor if
-    --sensor is not one of them; raises SettingsError if --sensors is not valid."""
+    """Collect the options of `add_table_options`, with the name `sensor` if not an option."""
     from mag_tracking.recording.field_table import TableOptions
 
     sensors = dict(text.rpartition('=')[::2] for text in args.sensors)

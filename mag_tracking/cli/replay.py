@@ -233,10 +233,7 @@ def _check_folders(args: argparse.Namespace, sources: Iterable[RecordingSource],
 def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Settings,
                 out: Path | None, tables: Sequence[Table], stopped: Callable[[], bool],
                 args: argparse.Namespace) -> bool:
-    """Compute the tables of one recording; an interrupted run leaves partial results.
-
-    The result is whether everything could be written.
-    """
+    """Compute the tables of one recording; return whether everything could be written."""
     sinks: list[Sink] = []
 
     def sinks_of(pipeline: Pipeline) -> list[Sink]:
@@ -302,8 +299,7 @@ def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool
 
 
 def _row(t: dict[str, Any], log: TrackLog, network: SensorNetwork) -> str:
-    """Format the row of a track: time and distance at its closest pose, speed at the most certain
-    one."""
+    """Format a track: time and distance at its closest pose, speed at the most certain one."""
     distances = np.linalg.norm(np.array(log.position) - network.centre, axis=1)
     closest, best = int(np.argmin(distances)), log.most_certain()
     return vehicle_row(

@@ -54,10 +54,7 @@ HEADER = vehicle_row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'clo
 
 
 class Events:
-    """Events of each recording, written to the folder of the recording.
-
-    Each table names the last stage that it needs, `upto`.
-    """
+    """Events of each recording; `upto` of each table is the last stage that it needs."""
 
     upto = 'calibrate'
 

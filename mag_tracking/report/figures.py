@@ -45,10 +45,7 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
 
 def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None = None,
                smoothed: ArrayLike | None = None) -> Figure:
-    """Plot a track with 90 % ellipses, its hypotheses by arrival direction, sensors and truth.
-
-    `truth` and `smoothed` are positions (n, 3) [m] in the world frame.
-    """
+    """Plot a track with 90 % ellipses, hypotheses, sensors, and paths (n, 3) [m]."""
     figure = Figure(figsize=(8.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
     positions = np.array(log.position)[:, :2]
@@ -85,10 +82,7 @@ def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None =
 
 
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
-    """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_WEIGHT`.
-
-    Nothing is plotted for a track with a single direction.
-    """
+    """Plot the best hypothesis of each of several arrival directions above `MIN_WEIGHT`."""
     colours = _colours(log)
     if len(colours) < 2:
         return
@@ -123,10 +117,7 @@ def weights_figure(log: TrackLog) -> Figure:
 
 
 def field_figure(log: TrackLog, network: SensorNetwork) -> Figure:
-    """Plot the measured field and the field of the best hypothesis, per sensor and axis.
-
-    In a large network, only the `strongest_sensors` are plotted, and the title states how many.
-    """
+    """Plot the measured and the predicted field of the `strongest_sensors` per axis."""
     measured, predicted = np.array(log.measured), np.array(log.predicted)
     sensors = strongest_sensors(log)
     n_columns = 2 if len(sensors) > 1 else 1

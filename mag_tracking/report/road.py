@@ -33,11 +33,10 @@ class Road:
 
 
 def road_of(sensors: FloatArray, paths: Sequence[FloatArray]) -> Road:
-    """Infer the road on which vehicles have passed a network, from positions in the world frame
-    [m].
+    """Infer the road on which vehicles have passed a network, from positions [m, world frame].
 
-    The carriageway is straight and as wide as the paths along it. If sensors stand on both sides,
-    it fills the space between them. A path that leaves it is surrounded by a side road.
+    The carriageway is straight and as wide as the paths along it, and fills the space between
+    sensors on both sides. A path that leaves it is surrounded by a side road.
     """
     paths = [path for path in map(_thinned, paths) if len(path) > 2]
     if not paths:

@@ -57,10 +57,7 @@ def legend_beside(axes: 'Axes') -> None:
 
 
 def plain_log_ticks(axes: 'Axes') -> None:
-    """Label a logarithmic y axis with plain numbers such as 0.02 and 3 instead of powers of ten.
-
-    An axis that spans more than six decades is left unchanged.
-    """
+    """Label a logarithmic y axis of up to six decades with plain numbers such as 0.02 and 3."""
     # Imported here because pages, which use the colours and units, do not need matplotlib.
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -74,10 +71,7 @@ def plain_log_ticks(axes: 'Axes') -> None:
 
 
 def save_figure(figure: 'Figure', path: str | PathLike[str]) -> None:
-    """Write a figure in the format that the file suffix selects; replaces an existing file or link.
-
-    Raises OSError if the file cannot be written.
-    """
+    """Write a figure in the format of the suffix, in place of any file or link; raises OSError."""
     image = io.BytesIO()
     figure.savefig(image, format=Path(path).suffix.removeprefix('.').lower(), dpi=DOTS_PER_INCH)
     with new_binary_file(path) as stream:

@@ -42,22 +42,11 @@ LOG = getLogger('mag_tracking.web')
 
 
 class PageServer:
-    """Server of the live page, for up to `MAX_VIEWERS` browsers.
+    """Server of the live page, for up to `MAX_VIEWERS` browsers; port 0 selects a free port.
 
-    Raises DeviceError if the port cannot be opened.
-
-    Parameters
-    ----------
-    host : str, optional
-        Local address to listen on. Unless it is a loopback address, browsers need the token in
-        `url`.
-    port : int, optional
-        TCP port; 0 selects a free port.
-
-    Attributes
-    ----------
-    url : address of the page, including the token if there is one
-    n_lagged : number of times that messages to a lagging viewer were suspended
+    `url` contains a token, which browsers need, unless `host` is a loopback address. `n_lagged`
+    counts suspensions of messages to a lagging viewer. Raises DeviceError if the port cannot be
+    opened.
     """
 
     def __init__(self, source: 'LiveScene', host: str = LOOPBACK, port: int = DEFAULT_PORT) -> None:
@@ -140,11 +129,8 @@ class PageServer:
             return [json_text({'type': 'fault', 'text': description})]
 
     def _send_updates(self) -> None:
-        """Send new messages to all viewers.
-
-        A lagging viewer receives the complete scene when its buffer is empty. A viewer whose buffer
-        has not shrunk for `LAG_TIMEOUT_S` is disconnected.
-        """
+        """Send new messages to all viewers; a lagging one receives the complete scene when its
+        buffer is empty, and is disconnected if that has not shrunk for `LAG_TIMEOUT_S`."""
         if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
