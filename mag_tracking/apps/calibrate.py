@@ -1,6 +1,6 @@
 """Calibration of a network from a recording, by tumbling, or with a magnet above a board."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -86,6 +86,22 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
                 for j, record in enumerate(surveyed.calibrated)))
     return Calibration(calibrated, survey, evidence, rejected(stage.counts),
                        tuple(name for name in network.names if name not in levels), interrupted)
+
+
+def sensor_rows(network: SensorNetwork) -> Iterator[
+        tuple[str, float, float, float, float, float, FloatArray | None, str]]:
+    """Name, tilt, heading and its std [deg], clock offset and its std [s], noise (3,) [T] and
+    source of the calibration of each sensor; NaN if unknown."""
+    for j, (name, R, std) in enumerate(zip(network.names, network.R_ws, network.orientation_std,
+                                           strict=True)):
+        record = network.calibrated[j]
+        clock_std = np.nan if record is None else record.clock_offset_std
+        # The heading is that of the sensor's x axis in the horizontal plane.
+        yield (name, float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))),
+               float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
+               np.nan if std is None else float(np.degrees(std[2])),
+               np.nan if np.isnan(clock_std) else float(network.clock_offset[j]), clock_std,
+               network.noise_std[j], 'nominal orientation' if record is None else record.by)
 
 
 def _survey_recording(recording: Recording, network: SensorNetwork, settings: Settings, date: str,

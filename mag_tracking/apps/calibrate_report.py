@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from mag_tracking.apps.calibrate import Calibration, GeometrySurvey
+from mag_tracking.apps.calibrate import Calibration, GeometrySurvey, sensor_rows
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.geometry import yaw_between
@@ -91,21 +91,12 @@ def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[page.C
 
 
 def _table(calibration: Calibration) -> page.Table:
-    network, rows = calibration.network, list[list[str | float | None]]()
-    for j, name in enumerate(network.names):
-        R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
-        record = network.calibrated[j]
-        has_clock = record is not None and not np.isnan(record.clock_offset_std)
-        rows.append([
-            name, float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))),
-            float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
-            None if std is None else float(np.degrees(std[2])),
-            1e3 * float(network.clock_offset[j]) if has_clock else None,
-            1e3 * record.clock_offset_std if record is not None and has_clock else None,
-            None if noise is None else 1e9 * float(np.nanmean(noise)),
-            'nominal orientation' if record is None else record.by])
-    return page.Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
-                                  'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)
+    return page.Table(
+        'Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]', 'clock [ms]', 'std [ms]',
+                    'noise [nT]', 'source'],
+        [[name, *angles, 1e3 * clock, 1e3 * clock_std,
+          None if noise is None else 1e9 * float(np.nanmean(noise)), source]
+         for name, *angles, clock, clock_std, noise, source in sensor_rows(calibration.network)])
 
 
 def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figure:
@@ -177,7 +168,7 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
         axes.bar(indices, style.SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85',
                  width=0.8, label='uncertainty (90 %, per axis)')
         axes.plot(indices, magnitude, 'o', ms=4, color='tab:blue', label='correction')
-        _set_title(axes, title)
+        axes.set_title(title, fontsize=10, loc='left')
         axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0),
                     frameon=False)
         axes.grid(alpha=0.3)
@@ -196,14 +187,10 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
     return figure
 
 
-def _set_title(axes: Axes, title: str) -> None:
-    axes.set_title(title, fontsize=10, loc='left')
-
-
 def _mark_one(axes: Axes, title: str) -> None:
     """Set the title, and draw a line at 1, the expected value."""
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
-    _set_title(axes, title)
+    axes.set_title(title, fontsize=10, loc='left')
 
 
 def _plot_displacements(figure: SubFigure, axes: Axes, survey: GeometrySurvey,
@@ -240,7 +227,7 @@ def _plot_displacements(figure: SubFigure, axes: Axes, survey: GeometrySurvey,
     low, high = positions.min(axis=0) - 0.15 * extent, positions.max(axis=0) + 0.15 * extent
     axes.set(xlim=(low[a], high[a]), ylim=(low[b], high[b]), aspect='equal',
              xlabel=f'{"xyz"[a]} [m]', ylabel=f'{"xyz"[b]} [m]')
-    _set_title(axes, 'displacement from the nominal positions')
+    axes.set_title('displacement from the nominal positions', fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=3, loc='upper center', bbox_to_anchor=(0.5, -0.12),
                 frameon=False)
     figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'displacement along {"xyz"[c]} [mm]')

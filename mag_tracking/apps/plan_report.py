@@ -212,7 +212,10 @@ def _maps(plan: Plan) -> list[page.Chart]:
     low, high = np.nanquantile(bound, [LOW_QUANTILE, 1.0 - LOW_QUANTILE])
     position = page.heat_map(x, y, bound, 'Viridis', f'standard deviation [{unit}]', float(low),
                         float(high))
-    position['colorbar'] |= _log_ticks(low, high)
+    # The colour bar labels the logarithmic values with linear numbers.
+    ticks = [v for v in ROUND_NUMBERS if low <= np.log10(v) <= high] or [10.0**(0.5 * (low + high))]
+    position['colorbar'] |= {'tickvals': np.log10(ticks).tolist(),
+                             'ticktext': [f'{v:.3g}' for v in ticks]}
     position |= {'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
                  'hoverinfo': 'x+y+text'}
     gain_x, gain_y, gain = _gain(plan, f)
@@ -228,13 +231,6 @@ def _maps(plan: Plan) -> list[page.Chart]:
              'marker': {'symbol': 'star', 'size': 15, 'color': style.VERMILLION,
                         'line': {'color': '#ffffff', 'width': 1}}}], layout))
     return charts
-
-
-def _log_ticks(low: float, high: float) -> dict[str, Any]:
-    """Create the ticks of a colour bar that label logarithmic values with linear numbers."""
-    ticks = [v for v in ROUND_NUMBERS if low <= np.log10(v) <= high] or [
-        10.0 ** (0.5 * (low + high))]
-    return {'tickvals': np.log10(ticks).tolist(), 'ticktext': [f'{v:.3g}' for v in ticks]}
 
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:

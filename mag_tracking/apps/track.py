@@ -162,7 +162,7 @@ class TrackingResult(DisplayedResult):
         -------
         matplotlib.figure.Figure
         """
-        from mag_tracking.report.pass_picture import pass_figure
+        from mag_tracking.report.figures import pass_figure
 
         log = self._track_log(track_id)
         return pass_figure(log, self.network, self._smoothed_path(log.id), max_std)

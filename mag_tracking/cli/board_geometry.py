@@ -119,8 +119,7 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
                                    and np.less(*corners).all()):
         raise SettingsError(f'--high: expected values above {args.low} in x, y and z, got '
                             f'{args.high}')
-    for path in (args.out, args.figure):
-        options.check_writable(path)
+    options.check_outputs(args)
     return corners if args.unknown_poses else None
 
 

@@ -9,7 +9,7 @@ from typing import NoReturn
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.calibrate import Calibration, calibrate, tumble
+from mag_tracking.apps.calibrate import Calibration, calibrate, sensor_rows, tumble
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.cli import options
 from mag_tracking.errors import RecordingError, SettingsError
@@ -123,8 +123,12 @@ def _print(result: Calibration, recording: Recording) -> None:
     """Print the calibration as a table, followed by notes and warnings."""
     survey = result.survey
     print('sensor      tilt     heading [deg]    clock [ms]          noise [nT]           source')
-    for j, sensor in enumerate(survey.sensors):
-        print(f'{sensor.sensor:11s} {_row(result, j)}')
+    for name, tilt, heading, std, clock, clock_std, noise, source in sensor_rows(result.network):
+        std_text = '  (?)' if np.isnan(std) else f'({std:.1f})'
+        clock_text = '' if np.isnan(clock_std) else f'{1e3 * clock:+8.2f} ({1e3 * clock_std:.2f})'
+        noise_text = '' if noise is None else ' '.join(f'{1e9 * v:5.1f}' for v in noise)
+        print(f'{name:11s} {tilt:6.1f}  {heading:+8.1f} {std_text:>6s}  {clock_text:16s}  '
+              f'{noise_text:17s}  {source}')
     if survey.reference:
         print(f'clock offsets relative to {survey.reference}')
     if result.evidence is not None:
@@ -141,22 +145,6 @@ def _print(result: Calibration, recording: Recording) -> None:
         print('  note: passes were not used, because some sensors contradict the Earth\'s field')
     for cause, n in {**result.rejected, **recording.losses}.items():
         print(f'  warning: {cause}: {n}')
-
-
-def _row(result: Calibration, j: int) -> str:
-    network = result.network
-    R, std = network.R_ws[j], network.orientation_std[j]
-    tilt = np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
-    # Direction of the sensor's x axis in the horizontal plane.
-    heading = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
-    sd = '  (?)' if std is None else f'({np.degrees(std[2]):.1f})'
-    calibrated, noise = network.calibrated[j], network.noise_std[j]
-    clock = ' ' * 16
-    if calibrated is not None and not np.isnan(calibrated.clock_offset_std):
-        clock = f'{1e3 * network.clock_offset[j]:+8.2f} ({1e3 * calibrated.clock_offset_std:.2f})'
-    noise_column = ' '.join(f'{1e9 * v:5.1f}' for v in noise) if noise is not None else ' ' * 17
-    return (f'{tilt:6.1f}  {heading:+8.1f} {sd:>6s}  {clock:16s}  {noise_column}  '
-            f'{"nominal orientation" if calibrated is None else calibrated.by}')
 
 
 def _tumble(args: argparse.Namespace) -> int:

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 """Subparsers of the main parser or of a command, to which each command is added."""
 
-FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
-
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
@@ -122,13 +120,17 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Raise OutputError if the files of --out and --figure cannot be written, and SettingsError if
-    the file type of the figure is not supported."""
+    """Raise OutputError if --out or --figure cannot be written, SettingsError for the file type."""
     for path in (args.out, args.figure):
         check_writable(path)
-    if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
-        raise SettingsError(f'--figure: expected a file name ending in '
-                            f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
+    if args.figure is not None:
+        # Imported here because it loads matplotlib.
+        from matplotlib.backend_bases import FigureCanvasBase
+
+        types = FigureCanvasBase.get_supported_filetypes()
+        if args.figure.suffix.lower().removeprefix('.') not in types:
+            raise SettingsError(f'--figure: expected a file name ending in .{", .".join(types)}; '
+                                f'got {args.figure.name}')
 
 
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:

@@ -167,7 +167,7 @@ class PageServer:
         self._viewers[viewer] = _buffered_bytes(viewer) + MAX_BUFFERED
 
     async def _handle_viewer(self, viewer: ServerConnection) -> None:
-        if len(self._viewers) + len(self._lagging) >= MAX_VIEWERS:
+        if self.n_viewers >= MAX_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
         self._send_snapshot(viewer)
