@@ -181,16 +181,15 @@ class Pipeline:
 
 
 class Step(NamedTuple):
-    """A batch of raw readings and what the pipeline made of it."""
+    """A batch of raw readings, empty at the end of the source, and its records in order.
+
+    The last records follow from the end of the source; all frames precede them.
+    """
 
     readings: Readings
-    """Raw readings; empty at the end of the source."""
     received_ns: int | None
-    """Time of receipt [ns]; None if unknown."""
     records: Sequence[object]
-    """Records in order of processing."""
     is_last: bool = False
-    """Whether the records follow from the end of the source; all frames precede them."""
 
 
 _RECEIVERS = {

@@ -3,6 +3,7 @@
 import html
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, NoReturn, Protocol, TypeAlias
 
@@ -235,11 +236,9 @@ def prescan_of(source: Source, pipeline: Pipeline,
     source = source.beginning()
 
     def batches() -> Iterator[Readings]:
-        try:
+        with suppress(ReadingStopped):
             for readings, _ in until_stopped(source.batches, None, stopped):
                 yield readings
-        except ReadingStopped:
-            return
 
     found = prescan(batches(), pipeline.network, pipeline.settings.calibrate)
     return replace(found, clocks=dict(source.clocks))

@@ -20,8 +20,8 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import InputDoubts
-from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import replace_text
+from mag_tracking.errors import RecordingError
+from mag_tracking.files import output_errors, replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.cross_check import ClockComparison
@@ -65,15 +65,6 @@ class FrameChunk:
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
                 self.time_offset[k], bool(self.target_present[k]), float(self.statistic[k]),
                 int(self.degrees_of_freedom[k])), self.doubts.get(k)
-
-
-@contextmanager
-def output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an OutputError that names `path`."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
 @contextmanager

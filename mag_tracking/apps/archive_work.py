@@ -20,9 +20,9 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.apps import archive_segments as segments
-from mag_tracking.apps.passes import PassCollector, PassTracks, fitted_vehicles, ground_prior
+from mag_tracking.apps.fit import PassCollector, PassTracks, fitted_vehicles, ground_prior
 from mag_tracking.apps.replay import TrackHistory
-from mag_tracking.files import replace_text
+from mag_tracking.files import output_errors, replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step
 from mag_tracking.recording.reader import Recording
@@ -87,12 +87,12 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
     The first result is kept; all results are equal.
     """
     temporary = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
-    with segments.output_errors(final):
+    with output_errors(final):
         temporary.mkdir()
     try:
         yield temporary
         if not final.exists():
-            with segments.output_errors(final):
+            with output_errors(final):
                 try:
                     temporary.rename(final)
                 except OSError:

@@ -1,7 +1,6 @@
 """Figures and report of fitted passes: fields, model orders, map with time slider."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from mag_tracking.quantities import quantity
 from mag_tracking.report import page, style
 from mag_tracking.report.page_scene import field_entry, pose_entry, scene_of
 from mag_tracking.report.road import road_of
-from mag_tracking.results.result_folder import REPORT
 from mag_tracking.units import NS
 
 MAX_SENSORS = 6
@@ -97,12 +95,6 @@ def order_figure(passes: Sequence[FittedPass]) -> Figure:
     style.plain_log_ticks(axes)
     figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)', fontsize=11)
     return figure
-
-
-def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
-                 out: Path) -> None:
-    """Write the report of fitted passes, with `RecordingFit.warnings`, to `report.html`."""
-    fit_page(passes, network, warnings).write(out / REPORT)
 
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,

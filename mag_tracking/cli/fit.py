@@ -13,8 +13,7 @@ from tqdm import tqdm
 from mag_tracking.analysis.correlated_motion import contradicts_delays
 from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
-from mag_tracking.apps.fit import check_cpa_range, check_orders
-from mag_tracking.apps.passes import PassFitter
+from mag_tracking.apps.fit import PassFitter, check_cpa_range, check_orders
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli import options
 from mag_tracking.cli.tables import HEADER, time_of, vehicle_row
@@ -28,6 +27,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.results.fit_folder import FitFolder
+from mag_tracking.results.result_folder import REPORT
 from mag_tracking.run import RecordingSource, RunReport, progress_bar, run
 from mag_tracking.settings import read_parameter_file
 from mag_tracking.units import NS
@@ -168,10 +168,10 @@ def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings
                   args: argparse.Namespace) -> None:
     """Write the report of all passes, and draw their cost over the number of dipoles."""
     # Imported here, as in `_draw`, because it loads matplotlib.
-    from mag_tracking.apps.fit_report import order_figure, write_report
+    from mag_tracking.apps.fit_report import fit_page, order_figure
     from mag_tracking.report.style import save_figure
 
-    write_report(passes, network, warnings, args.out)
+    fit_page(passes, network, warnings).write(args.out / REPORT)
     if not passes:
         print('no passes: nothing was detected')
     elif not args.no_figures:
