@@ -211,6 +211,5 @@ class _Scheduler:
                 cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, reason: str) -> None:
-        """Record and report the failure of a recording; other recordings are still tracked."""
         self.result.failed[path] = reason
         self.report(f'{path.name}: {reason}')

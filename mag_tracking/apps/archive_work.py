@@ -131,7 +131,6 @@ class _Segmenter:
             'no_detection_reason': report.no_detection_reason or ''}
 
     def add(self, step: Step) -> None:
-        """Write the frames and the passes of a step, and the health rows that are due."""
         passes = self._passes.passes(step)
         for frame in step.records:
             if isinstance(frame, FieldFrame):
@@ -221,12 +220,10 @@ class _SegmentTracker(RecordReceiver):
         self._history.receive(records)
 
     def add_track(self, track: Track) -> None:
-        """Write the row of a pose; the closing record of a track has no row."""
         if not track.ended:
             self._add_pose('poses', track)
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Write the row of a pose smoothed over a whole track; fixed-lag poses have no row."""
         if pose.complete:
             self._add_pose('smoothed', pose)
 
@@ -251,7 +248,6 @@ class _SegmentTracker(RecordReceiver):
         self._tables['tracks'].add(columns)
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
-        """Fit a pass as a whole and write one row per vehicle."""
         recording = self._job.recording
         for vehicle in fitted_vehicles(
                 recording.stem, number, data, (fit_pass(data, N_DIPOLES),),

@@ -17,10 +17,7 @@ from mag_tracking.report import page
 from mag_tracking.report.style import AXIS_COLOURS
 from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.align.stage import frame_period_warning
-from mag_tracking.stages.calibrate.field_comparison import (
-    compared_with_earth,
-    earth_field_findings,
-)
+from mag_tracking.stages.calibrate import field_comparison
 from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
 from mag_tracking.stages.health import findings
 from mag_tracking.stages.health.clocks import clock_findings
@@ -113,7 +110,8 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     try:
-        return found + earth_field_findings(compared_with_earth(network, survey, levels))
+        fields = field_comparison.compared_with_earth(network, survey, levels)
+        return found + field_comparison.earth_field_findings(fields)
     except ValueError as error:
         return [*found, Finding(False, 'network', f'sensors were not compared: {error}',
                                 'add earth_field or site to the network file', Cause.NOT_COMPARED)]

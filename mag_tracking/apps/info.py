@@ -185,7 +185,6 @@ def _field_times(block: MessageBlock, topic: str, rows: IntArray, faults: 'Count
 
 def _batch_times(block: MessageBlock, topic: str, rows: IntArray, faults: 'Counter[str]'
                  ) -> Iterator[tuple[Source, IntArray, IntArray]]:
-    """Times of the readings of each sensor in the messages `rows` of a block."""
     for k in rows.tolist():
         message = block.message(k)
         try:

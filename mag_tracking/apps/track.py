@@ -267,8 +267,6 @@ def track(source: UserSource,
 
 
 class _Poses(TrackHistory):
-    """Also stores detections and poses."""
-
     def __init__(self) -> None:
         super().__init__()
         self.poses: list[Track] = []

@@ -145,7 +145,6 @@ def _elapsed_time(task: str) -> Iterator[None]:
 
 
 def _print(survey: calibrate.GeometrySurvey, has_unknown_poses: bool) -> None:
-    """Print the calibration as a table, followed by its quality and warnings."""
     g = survey.geometry
     if g.converged:
         print('sensor      shift [mm]    rotation [deg] gain            '

@@ -120,7 +120,6 @@ def _network(args: argparse.Namespace) -> int:
 
 
 def _print(result: Calibration, recording: Recording) -> None:
-    """Print the calibration as a table, followed by notes and warnings."""
     survey = result.survey
     print('sensor      tilt     heading [deg]    clock [ms]          noise [nT]           source')
     for name, tilt, heading, std, clock, clock_std, noise, source in sensor_rows(result.network):
@@ -196,7 +195,6 @@ def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource
 
 
 def _print_fit(name: str, fit: EllipsoidFit) -> None:
-    """Print the ellipsoid fit of one sensor, or the reason for its rejection."""
     if not fit.converged:
         print(f'{name}: calibration rejected: {fit.reason}')
     else:

@@ -166,7 +166,6 @@ def _fit(args: argparse.Namespace) -> int:
 
 def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                   args: argparse.Namespace) -> None:
-    """Write the report of all passes, and draw their cost over the number of dipoles."""
     # Imported here, as in `_draw`, because it loads matplotlib.
     from mag_tracking.apps.fit_report import fit_page, order_figure
     from mag_tracking.report.style import save_figure
@@ -202,7 +201,6 @@ def _closest_approach(fit: PassFit) -> tuple[float, float, float, float]:
 
 
 def _print_details(fitted_pass: FittedPass) -> None:
-    """Print the fits of one pass as a table, one row per number of dipoles."""
     data = fitted_pass.fits[0].data
     print(f'{fitted_pass.recording}, {fitted_pass.label}: '
           f'{quantity(data.n_values, "measurement")}, '
@@ -250,7 +248,6 @@ def _print_chosen(fitted_pass: FittedPass, chosen: PassFit) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format speed, direction and time of a rejected fit, as far as they are reliable."""
     time, time_std, _, _ = _closest_approach(fit)
     values = {'speed': f'{_with_std(fit.speed, 2)} m/s',
               'direction': f'{_with_std(np.degrees(fit.heading), 1)} deg',

@@ -269,7 +269,6 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
 
 def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
            args: argparse.Namespace) -> None:
-    """Write the optional files of the tracks, the report and the figures."""
     if args.tum:
         write_trajectories(result, out)
     if args.rerun:
@@ -280,7 +279,6 @@ def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[],
 
 
 def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool) -> None:
-    """Print counts and notes of a run, and a row and the warnings of each track."""
     counts, tracks = result.summary['counts'], result.summary['tracks']
     verdicts = Counter(t['verdict'] for t in tracks)
     print(f'{name}: {quantity(counts["align"].get("frames", 0), "frame")}, '

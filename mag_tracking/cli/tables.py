@@ -150,7 +150,6 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> traffic.Fleet | 
 
 def _enrol(args: argparse.Namespace, network: SensorNetwork,
            passes: list[traffic_tables.FleetPass]) -> None:
-    """Add passes of the vehicle named by --enrol to the fleet file."""
     fleet = traffic_tables.read_fleet(args.fleet) if args.fleet.exists() else {}
     fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
     # `Fleet` raises an error before a vehicle that cannot be enrolled is written.

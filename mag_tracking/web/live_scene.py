@@ -108,7 +108,6 @@ class LiveScene:
             self._clear()
 
     def _clear(self) -> None:
-        """Discard all frames and tracks, and start a new scene."""
         self._begin_ns: int | None = None
         self._end_ns = self._frame_ns = 0
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
@@ -221,7 +220,6 @@ class LiveScene:
                           'tables': [asdict(table) for table in self._tables]})
 
     def _extend_time(self, stamp_ns: int) -> None:
-        """Extend the time range of the scene to include a timestamp."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that may have been sent earlier had no start time.

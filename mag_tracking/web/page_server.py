@@ -93,7 +93,6 @@ class PageServer:
         self.close()
 
     def _run(self) -> None:
-        """Run the event loop in the server thread until `close` is called."""
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._serve())
@@ -101,7 +100,6 @@ class PageServer:
             self._loop.close()
 
     async def _serve(self) -> None:
-        """Accept viewers and send updates until `close` is called."""
         # Malformed requests must not fill the log.
         LOG.addFilter(lambda record: record.msg != 'opening handshake failed')
         # Compression would be repeated for every viewer.
