@@ -16,10 +16,10 @@ FILES = sorted(PACKAGE.rglob('*.py'))
 MAX_FILE_LINES, MAX_FUNCTION_LINES = 350, 40
 """Maximum lines of a file and of a function, without docstrings."""
 BUDGETS = {
-    'cli': 3100, 'nodes': 4300, 'apps': 6110, 'results': 1450, 'drivers': 5400, 'recording': 4500,
-    'web': 570, 'stages': 12270, 'analysis': 3000, 'messages': 1550, 'simulation': 250,
-    'physics': 2450, 'inference': 3100, 'calibration': 5500, 'network': 850, 'report': 960,
-    'modules': 2900}
+    'cli': 2750, 'nodes': 4300, 'apps': 5200, 'results': 1450, 'drivers': 5400, 'recording': 4500,
+    'web': 540, 'stages': 12270, 'analysis': 3000, 'messages': 1550, 'simulation': 250,
+    'physics': 2450, 'inference': 3100, 'calibration': 5500, 'network': 850, 'report': 890,
+    'modules': 2600}
 """Maximum lines of each package, and of the modules outside packages, in Python and C++ with
 docstrings. A change may lower a budget; one that raises it says why."""
 
