@@ -212,32 +212,21 @@ def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
     n_serious = sum(d.serious for d in diagnoses)
     numbers = (f'{quantity(n_serious, "serious finding")}, '
                f'{quantity(len(diagnoses) - n_serious, "note")}')
-    page.Page(f'Health of {subject}', numbers, notes, None, _charts(doctor),
-              [_table(doctor)]).write(path)
-
-
-def _charts(doctor: Doctor) -> list[page.Chart]:
     names = [escape(name, quote=False) for name in doctor.sensors]
     noise = [{'type': 'bar', 'x': names, 'name': letter, 'marker': {
         'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
         'y': [1e9 * float(h.noise_std[axis]) for h in doctor.sensors.values()]}
         for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True))]
-    rates = [float(h.rate) if h.counts['readings'] else 0.0 for h in doctor.sensors.values()]
-    return [page.Chart('Noise per axis', noise, page.axes('', 'standard deviation [nT]')),
-            page.Chart('Sample rate', [
-                {'type': 'bar', 'x': names, 'y': rates, 'showlegend': False}],
-                page.axes('', 'rate [Hz]'))]
-
-
-def _table(doctor: Doctor) -> page.Table:
-    rows: list[list[str | float | None]] = []
-    for name, health in doctor.sensors.items():
-        c, delay = health.counts, float(health.delay_s[0])
-        has_readings = bool(c['readings'])
-        rows.append([
-            name, c['readings'], float(health.rate) if has_readings else None, c['lost'],
-            c['duplicates'], c['spikes'],
-            1e6 * float(np.sqrt(np.nansum(health.field**2))) if has_readings else None,
-            1e3 * delay if abs(delay) < MAX_LIVE_DELAY_S else None])
-    return page.Table('Sensors', ['sensor', 'readings', 'rate [Hz]', 'lost', 'duplicates', 'spikes',
-                                  'field [µT]', 'delay [ms]'], rows)
+    rates = [float(h.rate) if h.counts['readings'] else None for h in doctor.sensors.values()]
+    rows = [[name, h.counts['readings'], rate, h.counts['lost'], h.counts['duplicates'],
+             h.counts['spikes'],
+             None if rate is None else 1e6 * float(np.sqrt(np.nansum(h.field**2))),
+             1e3 * float(h.delay_s[0]) if abs(h.delay_s[0]) < MAX_LIVE_DELAY_S else None]
+            for (name, h), rate in zip(doctor.sensors.items(), rates, strict=True)]
+    charts = [
+        page.Chart('Noise per axis', noise, page.axes('', 'standard deviation [nT]')),
+        page.Chart('Sample rate', [{'type': 'bar', 'x': names, 'y': [rate or 0.0 for rate in rates],
+                                    'showlegend': False}], page.axes('', 'rate [Hz]'))]
+    table = page.Table('Sensors', ['sensor', 'readings', 'rate [Hz]', 'lost', 'duplicates',
+                                   'spikes', 'field [µT]', 'delay [ms]'], rows)
+    page.Page(f'Health of {subject}', numbers, notes, None, charts, [table]).write(path)

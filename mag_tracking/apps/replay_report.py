@@ -109,11 +109,12 @@ def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
     """Create the notes on a replay from the content of `summary.json`."""
-    return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
-            *(Note(NOTE, _describe_disturbance(d)) for d in summary['disturbances'])]
+    return [*_notes(summary), *(Note(NOTE, _describe_disturbance(d))
+                                for d in summary['disturbances'])]
 
 
-def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
+def _notes(summary: Mapping[str, Any]) -> Iterator[Note]:
+    """Notes on diagnoses and backgrounds, limitations of the tracks, and wrong poses."""
     for diagnosis in summary['diagnoses']:
         yield Note(WARNING if diagnosis['serious'] else NOTE, diagnosis['text'])
     for name, s in summary['sensors'].items():
@@ -121,9 +122,6 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
             begin, end = s['quiet_stretch_s']
             yield Note(NOTE, f'no quiet interval at the start: the most frequent level of '
                        f'{name}, from {begin:.1f} to {end:.1f} s, is used as its background')
-
-
-def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     counts = summary['counts']['track']
     reason = no_track_reason(counts)
     if reason:
@@ -143,9 +141,6 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     for cause, one, several, text in COUNTED:
         if n := counts.get(cause, 0):
             yield Note(WARNING, quantity(n, one, several) + text)
-
-
-def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     poses = summary['unflagged_poses']
     if poses and poses['n']:
         yield Note(NOTE, f'unambiguous poses: {poses["n"]}, of which {poses["wrong"]} '
