@@ -4,7 +4,8 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
 from os import PathLike, fspath
 from pathlib import Path
 from reprlib import Repr
@@ -39,11 +40,18 @@ def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Pa
 def output_folder(path: str | PathLike[str]) -> Path:
     """Create a folder for results if it does not exist; raises OutputError if this fails."""
     folder = checked_path(path, OutputError)
-    try:
+    with output_errors(f'to {folder}'):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f'cannot write to {folder}: {error.strerror}') from error
     return folder
+
+
+@contextmanager
+def output_errors(place: str | Path) -> Iterator[None]:
+    """Convert an OSError to an OutputError that names `place`, a path or `to FOLDER`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f'cannot write {place}: {error.strerror}') from error
 
 
 def new_text_file(path: str | PathLike[str], newline: str | None = None) -> TextIO:

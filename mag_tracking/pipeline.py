@@ -74,11 +74,8 @@ and 3 rad/s), or a magnet that is moved step by step on a bench."""
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
-    """Settings for a target, a key of `TARGET_DEFAULTS`, with changes by dotted name.
-
-    Raises SettingsError if `target` is unknown, if a change is invalid, or if the change of
-    `track.target` differs from the target.
-    """
+    """Settings for a key of `TARGET_DEFAULTS` with changes by dotted name; raises SettingsError if
+    one is invalid, or changes `track.target` to another."""
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
     defaults, changes = TARGET_DEFAULTS[target], dict(changes or {})
@@ -118,10 +115,7 @@ class Pipeline:
             self.traffic = Traffic(network, settings.traffic, settings.track.target == 'vehicle')
 
     def feed(self, readings: Readings) -> list[Output]:
-        """Process raw readings; return the resulting records in order of processing.
-
-        The records do not depend on how the readings are split into batches.
-        """
+        """Process raw readings, in batches of any size; return the resulting records in order."""
         return self._process_calibrated(self.calibrate.feed(readings))
 
     def flush(self) -> list[Output]:
@@ -158,7 +152,6 @@ class Pipeline:
         return out
 
     def _process_frame(self, frame: FieldFrame) -> Iterator[Output]:
-        """Yield the records that result from a frame."""
         if 'detect' not in self._names:
             yield frame
             return
@@ -188,16 +181,15 @@ class Pipeline:
 
 
 class Step(NamedTuple):
-    """A batch of raw readings and what the pipeline made of it."""
+    """A batch of raw readings, empty at the end of the source, and its records in order.
+
+    The last records follow from the end of the source; all frames precede them.
+    """
 
     readings: Readings
-    """Raw readings; empty at the end of the source."""
     received_ns: int | None
-    """Time of receipt [ns]; None if unknown."""
     records: Sequence[object]
-    """Records in order of processing."""
     is_last: bool = False
-    """Whether the records follow from the end of the source; all frames precede them."""
 
 
 _RECEIVERS = {
@@ -207,7 +199,11 @@ _RECEIVERS = {
 
 
 class RecordReceiver:
-    """Sink that passes each record to the method for its type; subclasses override some."""
+    """Sink that passes each record to the method of `_RECEIVERS` for its type, where there is one.
+
+    `add_frame` precedes `add_track` of the same time. `add_disturbance` receives a disturbance when
+    it is detected and again when it has ended.
+    """
 
     def add(self, step: Step) -> None:
         """Receive the records of a step."""
@@ -216,29 +212,6 @@ class RecordReceiver:
     def receive(self, records: Iterable[object]) -> None:
         """Receive records in order of processing."""
         for record in records:
-            if name := _RECEIVERS.get(type(record)):
-                getattr(self, name)(record)
-
-    def add_calibrated(self, readings: Readings) -> None:
-        """Receive a batch of calibrated readings."""
-
-    def add_frame(self, frame: FieldFrame) -> None:
-        """Receive a frame, which precedes its tracks."""
-
-    def add_detection(self, detection: Detection) -> None:
-        """Receive the onset or release of a detection."""
-
-    def add_track(self, track: Track) -> None:
-        """Receive a pose, or the closing record of a track."""
-
-    def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Receive a smoothed pose."""
-
-    def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Receive a disturbance, when it is detected and again when it has ended."""
-
-    def add_passage(self, passage: VehiclePassage) -> None:
-        """Receive the passage of a vehicle."""
-
-    def add_traffic(self, summary: TrafficSummary) -> None:
-        """Receive the summary of the traffic in an interval."""
+            method = getattr(self, _RECEIVERS.get(type(record), ''), None)
+            if method is not None:
+                method(record)

@@ -3,6 +3,7 @@
 import html
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, NoReturn, Protocol, TypeAlias
 
@@ -17,13 +18,9 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.prescan import Prescan, prescan
+from mag_tracking.stages.health import findings
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.findings import (
-    no_detection_reason,
-    sensor_findings,
-    source_findings,
-)
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
 
@@ -239,11 +236,9 @@ def prescan_of(source: Source, pipeline: Pipeline,
     source = source.beginning()
 
     def batches() -> Iterator[Readings]:
-        try:
+        with suppress(ReadingStopped):
             for readings, _ in until_stopped(source.batches, None, stopped):
                 yield readings
-        except ReadingStopped:
-            return
 
     found = prescan(batches(), pipeline.network, pipeline.settings.calibrate)
     return replace(found, clocks=dict(source.clocks))
@@ -255,11 +250,11 @@ def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan,
     counts, missing = pipeline.counts(), tuple(source.missing_topics())
     not_used = dict(Counter(source.rejected) + Counter(pipeline.rejections()))
     # Of an interrupted run, the rest may contain what is missing.
-    reason = None if interrupted or 'detect' not in counts else no_detection_reason(
+    reason = None if interrupted or 'detect' not in counts else findings.no_detection_reason(
         pipeline.network, pipeline.calibrate, pipeline.detect, missing, not_used)
-    found = [*source_findings(source.name, source.lost, source.rejected),
-             *sensor_findings(pipeline.network, pipeline.calibrate, pipeline.settings.track,
-                              missing, source.clocks)]
+    found = [*findings.source_findings(source.name, source.lost, source.rejected),
+             *findings.sensor_findings(pipeline.network, pipeline.calibrate,
+                                       pipeline.settings.track, missing, source.clocks)]
     for stage, counts_of_stage in counts.items():
         if stage != 'calibrate' and (causes := rejected(counts_of_stage)):
             found.append(Finding(False, stage, ', '.join(

@@ -316,7 +316,7 @@ def as_ros_parameters(path: str | PathLike[str]) -> str | None:
     if not isinstance(content, Mapping) or any(
             isinstance(v, Mapping) and 'ros__parameters' in v for v in content.values()):
         return None
-    lines = [f'    {name}: {_yaml_value(tuple(v) if isinstance(v, list) else v)}'
+    lines = [f'    {name}: {yaml_value(tuple(v) if isinstance(v, list) else v)}'
              for name, v in read_parameter_file(path).items() if v != {}]
     return '\n'.join(['/**:', '  ros__parameters:', *lines, ''])
 
@@ -336,10 +336,10 @@ def _merged_sections(content: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _yaml_value(value: Value) -> str:
+def yaml_value(value: Value) -> str:
     """Format a value as YAML that is read back with the same type."""
     if isinstance(value, tuple):
-        return '[' + ', '.join(_yaml_value(v) for v in value) + ']'
+        return '[' + ', '.join(yaml_value(v) for v in value) + ']'
     if isinstance(value, bool):
         return 'true' if value else 'false'
     if isinstance(value, float):
@@ -365,12 +365,12 @@ def to_yaml(settings: 'DataclassInstance', level: str = '') -> str:
         indent = '      ' if group else '    '
         if not row:
             for leaf, p in members.items():
-                lines += [f'{indent}# {_comment(p)}', f'{indent}{leaf}: {_yaml_value(p.value)}']
+                lines += [f'{indent}# {_comment(p)}', f'{indent}{leaf}: {yaml_value(p.value)}']
         else:
             if not previous_row:
                 lines += [f'{indent}# {leaf}: {_comment(p)}' for leaf, p in members.items()]
             lines.append(f'{indent}{row}: {{' + ', '.join(
-                f'{leaf}: {_yaml_value(p.value)}' for leaf, p in members.items()) + '}')
+                f'{leaf}: {yaml_value(p.value)}' for leaf, p in members.items()) + '}')
         previous_group, previous_row = group, row
     return '\n'.join(lines) + '\n'
 

@@ -1,4 +1,1 @@
-"""Applications that can be called from Python without ROS.
-
-Most commands that process recordings have a module of the same name.
-"""
+"""Applications without ROS; most commands for recordings have a module of the same name."""

@@ -25,7 +25,6 @@ from mag_tracking.results.parquet_table import import_pyarrow
 _Cluster = Cluster[tuple[str, Job]]
 
 METADATA = 'metadata.yaml'
-"""Name of the file that marks a folder as a rosbag2 recording."""
 
 
 @dataclass
@@ -40,17 +39,12 @@ class ArchiveRun:
     passes: int = 0
     """Number of fitted passes, one per vehicle."""
     lost_workers: int = 0
-    """Number of lost workers, whose tasks were repeated."""
     interrupted: bool = False
-    """Whether the run was stopped before all recordings were tracked."""
 
 
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
-    """Resolve paths, folders and glob patterns to recordings, each once, in the order of `names`.
-
-    Folders are searched recursively; entries whose name begins with a dot are skipped. A folder
-    that contains metadata.yaml is a recording. Raises RecordingError if a name matches none.
-    """
+    """Resolve paths, folders (searched recursively) and glob patterns to recordings, each once;
+    raises RecordingError if a name matches none."""
     selected: dict[Path, None] = {}
     for name in names:
         path = checked_path(name, RecordingError)
@@ -66,8 +60,7 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Recordings at or below a path that are not in folders of `visited`, which is extended; an
-    unreadable folder is returned, so that it is reported as failed."""
+    """Recordings at or below a path, without folders of `visited`; unreadable ones are included."""
     path = path.resolve()
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in SUFFIXES else []
@@ -99,13 +92,10 @@ def archive(recordings: Iterable[str | PathLike[str]],
             report: Callable[[str], object] | None = None) -> ArchiveRun:
     """Track recordings, also in folders and by glob patterns, and write the results to a dataset.
 
-    Recordings tracked by an earlier run are skipped unless they have changed. The tables contain
-    the same rows as a separate replay of each recording. The address of a Dask `scheduler`, such as
-    tcp://10.0.0.5:8786, replaces the `workers` processes on this machine; its workers need this
-    package, and the recordings and `out` under the same paths. `progress` is called with the size
-    in bytes of each completed or skipped recording, and `report` with a message for each recording
-    that fails and each damaged file. `stopped` is called several times per second; the run ends
-    when it returns true, and the next run continues it.
+    Recordings that an earlier run has tracked are skipped unless they have changed. `progress` is
+    called with the size in bytes of each completed or skipped recording, and `report` with a
+    message for each recording that fails and each damaged file. The run ends when `stopped` returns
+    true.
 
     Raises RecordingError if a name matches nothing, OutputError if the dataset is in use or was
     created with another network, other settings or another version of the tables, ClusterError if
@@ -221,6 +211,5 @@ class _Scheduler:
                 cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, reason: str) -> None:
-        """Record and report the failure of a recording; other recordings are still tracked."""
         self.result.failed[path] = reason
         self.report(f'{path.name}: {reason}')

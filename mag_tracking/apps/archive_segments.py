@@ -20,8 +20,8 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import InputDoubts
-from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import replace_text
+from mag_tracking.errors import RecordingError
+from mag_tracking.files import output_errors, replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.cross_check import ClockComparison
@@ -35,7 +35,6 @@ CHUNK_FRAMES = 2000
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
 TRACKED_FILE = 'tracked.json'
-"""Name of the file with the result of a tracked segment."""
 Doubts = InputDoubts
 """{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
@@ -46,10 +45,7 @@ _PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
 
 @dataclasses.dataclass(frozen=True)
 class FrameChunk:
-    """Attributes of n consecutive frames, stacked, and the passes that ended during these frames.
-
-    `doubts` are {index of a frame: doubtful times that apply from this frame on}.
-    """
+    """Attributes of n frames, stacked; passes that ended then; {index: doubts from a frame on}."""
 
     stamp_ns: IntArray
     field: FloatArray
@@ -63,22 +59,12 @@ class FrameChunk:
     passes: tuple[NumberedPass, ...]
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
-        """Iterate over the frames, each with the doubtful times, or None if they have not
-        changed."""
+        """Iterate over the frames, each with the doubtful times, or None if they are unchanged."""
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
                 self.time_offset[k], bool(self.target_present[k]), float(self.statistic[k]),
                 int(self.degrees_of_freedom[k])), self.doubts.get(k)
-
-
-@contextmanager
-def output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an OutputError that names `path`."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
 @contextmanager
@@ -114,11 +100,8 @@ def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
 
 
 class SegmentWriter:
-    """Writes each segment of a recording to a separate folder, using bounded memory.
-
-    The folders are `segment-0`, ..., each with the chunks `0.npz`, ... `lookback_s` is the time
-    span of the earlier frames that a new track uses.
-    """
+    """Writes segments to the folders `segment-0`, ..., each with the chunks `0.npz`, ...;
+    `lookback_s` is the time span of the earlier frames that a new track uses."""
 
     def __init__(self, folder: Path, lookback_s: float) -> None:
         self._folder = folder
@@ -136,9 +119,8 @@ class SegmentWriter:
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
         """Add the next frame, with the doubtful times of each sensor as known then.
 
-        A segment with at least `MIN_SEGMENT_FRAMES` frames ends after an interval without a target
-        that is longer than `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back
-        while no target is present.
+        A segment with `MIN_SEGMENT_FRAMES` ends after an interval without a target longer than
+        `lookback_s` and `MIN_QUIET_S`, any segment if the time jumps back without a target.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1

@@ -19,17 +19,10 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.track_log import TrackLog
-from mag_tracking.apps.archive_segments import (
-    ClockComparisonHistory,
-    SegmentResult,
-    SegmentWriter,
-    output_errors,
-    read_segment,
-    work_file_errors,
-)
-from mag_tracking.apps.passes import PassCollector, PassTracks, fitted_vehicles, ground_prior
+from mag_tracking.apps import archive_segments as segments
+from mag_tracking.apps.fit import PassCollector, PassTracks, fitted_vehicles, ground_prior
 from mag_tracking.apps.replay import TrackHistory
-from mag_tracking.files import replace_text
+from mag_tracking.files import output_errors, replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step
 from mag_tracking.recording.reader import Recording
@@ -46,11 +39,9 @@ N_DIPOLES = 3
 """Number of dipoles in the row that models a vehicle; a joint fit of several vehicles also tries
 one fewer."""
 CUT_FILE = 'columns.json'
-"""Name of the file in which `cut` stores its result for later tasks."""
 HEALTH_INTERVAL_S = 600.0
 """Interval between the rows of a sensor in the table `health` [s]."""
 SEGMENT_TABLES = ('tracks', 'poses', 'smoothed', 'passes')
-"""Tables that are filled from the segments."""
 _COLUMNS_OF_JOIN = ('tracks', 'passes', 'error')
 
 
@@ -82,7 +73,7 @@ def cut(job: Job) -> dict[str, Any]:
             with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
                 columns = _Segmenter(job, folder, table).read()
             replace_text(folder / CUT_FILE, json.dumps(columns))
-    with work_file_errors(job.cut_folder / CUT_FILE):
+    with segments.work_file_errors(job.cut_folder / CUT_FILE):
         stored: dict[str, Any] = json.loads((job.cut_folder / CUT_FILE).read_text())
         check_row(stored, [c for c in TABLES['recordings'] if c.name not in _COLUMNS_OF_JOIN])
     return stored
@@ -118,7 +109,7 @@ class _Segmenter:
         self._source = RecordingSource(Recording(job.recording), job.network)
         self._path, self._pipeline = job.recording, Pipeline(job.network, job.settings, 'detect')
         self._passes = PassCollector(self._pipeline)
-        self._writer = SegmentWriter(folder, job.settings.track.lookback_s)
+        self._writer = segments.SegmentWriter(folder, job.settings.track.lookback_s)
         self._health = health
         self._previous_counts = dict.fromkeys(job.network.names, (0, 0))
         self._next_health_ns: int | None = None
@@ -127,7 +118,6 @@ class _Segmenter:
         self._n_passes = 0
 
     def read(self) -> dict[str, Any]:
-        """Write the segments and the health table; return columns of the table `recordings`."""
         report = run(self._source, self._pipeline, [self])
         self._writer.close()
         if self._last_ns is not None:
@@ -141,7 +131,6 @@ class _Segmenter:
             'no_detection_reason': report.no_detection_reason or ''}
 
     def add(self, step: Step) -> None:
-        """Write the frames and the passes of a step, and the health rows that are due."""
         passes = self._passes.passes(step)
         for frame in step.records:
             if isinstance(frame, FieldFrame):
@@ -154,8 +143,7 @@ class _Segmenter:
             self._writer.add_pass(self._n_passes, data, notes)
 
     def _add_due_health(self, stamp_ns: int) -> None:
-        """Write the health rows `HEALTH_INTERVAL_S` after the previous ones, or after the first
-        frame or a time jump."""
+        """Write the health rows that are due after a frame, also after a time jump."""
         interval_ns = int(HEALTH_INTERVAL_S * NS)
         if self._next_health_ns is None or stamp_ns < self._next_health_ns - interval_ns:
             self._next_health_ns = stamp_ns + interval_ns
@@ -188,14 +176,14 @@ def track_segment(job: Job, k: int) -> None:
     """Track segment `k` and write its tables; raises RecordingError if it is damaged."""
     if not job.segment_folder(k).exists():
         with _atomic_folder(job.segment_folder(k)) as folder:
-            _SegmentTracker(folder, job, ClockComparisonHistory(len(job.network))).run(
+            _SegmentTracker(folder, job, segments.ClockComparisonHistory(len(job.network))).run(
                 k).write(folder)
 
 
 class _SegmentTracker(RecordReceiver):
     """Tracks a segment with the clock `evidence` of earlier segments, and writes its tables."""
 
-    def __init__(self, folder: Path, job: Job, evidence: ClockComparisonHistory) -> None:
+    def __init__(self, folder: Path, job: Job, evidence: segments.ClockComparisonHistory) -> None:
         self._folder, self._job, self._evidence = folder, job, evidence
         track = job.settings.track
         self._tracker = TrackManager(job.network, track, evidence)
@@ -204,12 +192,12 @@ class _SegmentTracker(RecordReceiver):
         self._tables: dict[str, TableWriter] = {}
         self._n_tracks = self._n_passes = 0
 
-    def run(self, k: int) -> SegmentResult:
-        """Track segment `k` and fit its passes."""
+    def run(self, k: int) -> segments.SegmentResult:
         with ExitStack() as files:
             self._tables = {name: files.enter_context(TableWriter(
                 self._folder / f'{name}.parquet', TABLES[name])) for name in SEGMENT_TABLES}
-            for chunk in read_segment(self._job.cut_folder / f'segment-{k}', self._job.network):
+            for chunk in segments.read_segment(self._job.cut_folder / f'segment-{k}',
+                                               self._job.network):
                 for frame, doubts in chunk.frames():
                     if doubts is not None:
                         self._tracker.set_input_doubts(doubts)
@@ -223,8 +211,8 @@ class _SegmentTracker(RecordReceiver):
             self._add_records(self._tracker.flush())
             for log in list(self._history.logs.values()):
                 self._add_track_row(log)
-        return SegmentResult(self._n_tracks, self._n_passes, self._evidence.clocks_differed,
-                             self._evidence.passes)
+        return segments.SegmentResult(self._n_tracks, self._n_passes,
+                                      self._evidence.clocks_differed, self._evidence.passes)
 
     def _add_records(self, records: list[Any]) -> None:
         """Write the rows of poses, and store the poses for the rows of their tracks."""
@@ -232,17 +220,14 @@ class _SegmentTracker(RecordReceiver):
         self._history.receive(records)
 
     def add_track(self, track: Track) -> None:
-        """Write the row of a pose; the closing record of a track has no row."""
         if not track.ended:
             self._add_pose('poses', track)
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Write the row of a pose smoothed over a whole track; fixed-lag poses have no row."""
         if pose.complete:
             self._add_pose('smoothed', pose)
 
     def _add_pose(self, table: str, pose: Track | SmoothedPose) -> None:
-        """Write the row of a published or smoothed pose."""
         self._tables[table].add(row_of(TABLES[table], pose, common_columns(
             self._job.recording, pose.stamp_ns)))
 
@@ -263,7 +248,6 @@ class _SegmentTracker(RecordReceiver):
         self._tables['tracks'].add(columns)
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
-        """Fit a pass as a whole and write one row per vehicle."""
         recording = self._job.recording
         for vehicle in fitted_vehicles(
                 recording.stem, number, data, (fit_pass(data, N_DIPOLES),),
@@ -283,12 +267,12 @@ def join(job: Job) -> dict[str, Any]:
     segments, and it is tracked again. Raises RecordingError if intermediate results are damaged.
     """
     columns = cut(job)
-    name, evidence = recording_key(job.recording), ClockComparisonHistory(len(job.network))
+    name, evidence = recording_key(job.recording), segments.ClockComparisonHistory(len(job.network))
     folders, id_offsets, n_tracks, n_passes = [], [], 0, 0
     with tempfile.TemporaryDirectory(dir=job.work_folder, prefix='.again.') as repeat_folder:
         for k in range(columns['segments']):
             folder = job.segment_folder(k)
-            result = SegmentResult.read(folder)
+            result = segments.SegmentResult.read(folder)
             evidence.passes = []
             combined_evidence = copy.deepcopy(evidence)
             for rigid_pass in result.clock_passes:

@@ -1,6 +1,6 @@
 """Calibration of a network from a recording, by tumbling, or with a magnet above a board."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -9,18 +9,9 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration import network_geometry, orientation
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
 from mag_tracking.calibration.network_fit import GeometrySettings
-from mag_tracking.calibration.network_geometry import (
-    NetworkGeometry,
-    calibrate_geometry,
-    calibrate_geometry_blind,
-)
-from mag_tracking.calibration.orientation import (
-    MountingEvidence,
-    fuse_mounting,
-    with_pass_mounting,
-)
 from mag_tracking.calibration.survey import NetworkSurvey, Survey, with_measured_noise
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import CalibrationRecord, SensorNetwork
@@ -52,14 +43,12 @@ class Calibration:
 
     network: SensorNetwork
     survey: NetworkSurvey
-    evidence: MountingEvidence | None
+    evidence: orientation.MountingEvidence | None
     """Orientations from passing targets; None if no pass was used."""
     rejected: dict[str, int]
     """Rejected samples: {cause: number}."""
     without_background: tuple[str, ...]
-    """Sensors whose background was not learnt."""
     interrupted: bool
-    """Whether the calibration was stopped before the end of the recording."""
 
 
 def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
@@ -67,9 +56,8 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
               stopped: Callable[[], bool] | None = None) -> Calibration:
     """Estimate orientations, clock offsets (from knocks) and noise of a network from a recording.
 
-    The recording must start without a target near the sensors. `passes` refines the nominal
-    orientations with passing targets, which reads the recording twice; it is omitted if
-    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field. Raises
+    `passes` refines the orientations with passing targets in a second pass over the recording,
+    unless `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field. Raises
     RecordingError if the recording has no samples of the network.
     """
     levels, survey, stage, interrupted = _survey_recording(
@@ -89,14 +77,31 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
             prior = np.array([
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
                 for s in surveyed.orientation_std])
-            evidence = fuse_mounting(surveyed, prior, tracks)
+            evidence = orientation.fuse_mounting(surveyed, prior, tracks)
             used = quantity(evidence.n_tracks, 'pass', 'passes')
-            calibrated = replace(with_pass_mounting(surveyed, evidence), calibrated=tuple(
+            fused = orientation.with_pass_mounting(surveyed, evidence)
+            calibrated = replace(fused, calibrated=tuple(
                 surveyed.calibration_record(j, date, f'nominal orientation; {used}')
                 if record is None else replace(record, date=date, by=f'{record.by}; {used}')
                 for j, record in enumerate(surveyed.calibrated)))
     return Calibration(calibrated, survey, evidence, rejected(stage.counts),
                        tuple(name for name in network.names if name not in levels), interrupted)
+
+
+def sensor_rows(network: SensorNetwork) -> Iterator[
+        tuple[str, float, float, float, float, float, FloatArray | None, str]]:
+    """Name, tilt, heading and its std [deg], clock offset and its std [s], noise (3,) [T] and
+    source of the calibration of each sensor; NaN if unknown."""
+    for j, (name, R, std) in enumerate(zip(network.names, network.R_ws, network.orientation_std,
+                                           strict=True)):
+        record = network.calibrated[j]
+        clock_std = np.nan if record is None else record.clock_offset_std
+        # The heading is that of the sensor's x axis in the horizontal plane.
+        yield (name, float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))),
+               float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
+               np.nan if std is None else float(np.degrees(std[2])),
+               np.nan if np.isnan(clock_std) else float(network.clock_offset[j]), clock_std,
+               network.noise_std[j], 'nominal orientation' if record is None else record.by)
 
 
 def _survey_recording(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
@@ -134,7 +139,6 @@ class _PassTracks(RecordReceiver):
         self._poses: dict[int, tuple[int, Track]] = {}
 
     def add_track(self, track: Track) -> None:
-        """Count a pose."""
         if not track.ended and not track.ambiguous:
             self._poses[track.id] = self._poses.get(track.id, (0, track))[0] + 1, track
 
@@ -147,11 +151,10 @@ def tumble(source: Source, network: SensorNetwork, sensors: Collection[str], dat
            field_magnitude: float | None = None, progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray]]:
-    """Estimate the hard and soft iron of sensors that were rotated during a recording.
+    """Estimate the hard and soft iron of `sensors` (default: all) that were rotated.
 
-    No `sensors` selects all. Without `field_magnitude` [T] of the ambient field, the mean gain of a
-    sensor is not calibrated. The results are the network with the corrections of the sensors whose
-    fit converged, the fits, and the readings (n, 3) [T, sensor frame].
+    Without `field_magnitude` [T], the mean gain is not calibrated. The results are the network with
+    the corrections that converged, the fits, and the readings (n, 3) [T, sensor frame].
     """
     rows = {name: network.index(name) for name in tuple(sensors) or network.names}
     collected: dict[str, list[FloatArray]] = {name: [np.empty((0, 3))] for name in rows}
@@ -201,13 +204,12 @@ class GeometrySurvey:
     """Network before the calibration, including the assumed noise."""
     network: SensorNetwork
     """Calibrated network; invalid if the estimation has not converged."""
-    geometry: NetworkGeometry
+    geometry: network_geometry.NetworkGeometry
     rows: IntArray
     """(K,) table rows of the poses used."""
     suspect_rows: tuple[int, ...]
     """Table rows of inconsistent poses."""
     n_poses: int
-    """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
     """(sensor, axes without readings) for each sensor that reports some axes but not all."""
 
@@ -236,12 +238,10 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
                     noise_std: float | None = None) -> GeometrySurvey:
     """Estimate the geometry of a network from its readings for many poses of a magnet.
 
-    The sensors of the nominal network are in the order of the columns of `table`
-    (`read_pose_table`); its offsets and corrections are applied. `moment` is in A m². With the
-    corners `box` (low, high) [m] around the magnet, the poses are estimated, and the table needs
-    only readings. `noise_std` [T], by default `ASSUMED_NOISE`, is that of sensors without a
-    configured noise and is stored only if given. Raises RecordingError if the table does not match
-    the network or does not suffice.
+    The sensors are in the order of the columns of `table`; `moment` is in A m². With the corners
+    `box` (low, high) [m] around the magnet, the poses are estimated. `noise_std` [T], by default
+    `ASSUMED_NOISE`, is that of sensors without a configured noise; it is stored only if given.
+    Raises RecordingError if the table does not match the network or does not suffice.
     """
     if box is None:
         readings, positions, axes = read_pose_table(table)
@@ -261,10 +261,11 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     try:
         if box is not None:
             low, high = (np.asarray(corner, dtype=float) for corner in box)
-            geometry = calibrate_geometry_blind(nominal, field, moment, low, high, settings)
+            geometry = network_geometry.calibrate_geometry_blind(
+                nominal, field, moment, low, high, settings)
         else:
-            geometry = calibrate_geometry(nominal, field[used], positions[used], axes[used],
-                                          moment, settings)
+            geometry = network_geometry.calibrate_geometry(
+                nominal, field[used], positions[used], axes[used], moment, settings)
     except ValueError as error:
         raise RecordingError(f'{table}: {error}') from error
     method = f'magnet, {len(geometry.rows)} {"unknown" if box is not None else "tracked"} poses'
@@ -285,8 +286,7 @@ def _with_noise(network: SensorNetwork, noise_std: float) -> SensorNetwork:
 
 
 def _corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
-    """Apply the offsets and corrections of a network to readings (K, n, 3), as the stage
-    Calibrate."""
+    """Apply offsets and corrections to readings (K, n, 3), as the stage Calibrate."""
     field = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
         if offset is not None:
@@ -299,8 +299,8 @@ def _corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
     return field
 
 
-def _calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
-                        method: str) -> SensorNetwork:
+def _calibrated_network(network: SensorNetwork, geometry: network_geometry.NetworkGeometry,
+                        date: str, method: str) -> SensorNetwork:
     """Network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from mag_tracking.apps.calibrate import Calibration, GeometrySurvey
+from mag_tracking.apps.calibrate import Calibration, GeometrySurvey, sensor_rows
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.geometry import yaw_between
@@ -45,10 +45,7 @@ def write_report(calibration: Calibration, nominal: SensorNetwork, name: str, pa
 
 
 def _knocks(calibration: Calibration) -> list[tuple[str, list[Curve]]]:
-    """Acceleration around the first knock by uncorrected and by corrected clocks: (title, curves).
-
-    A curve is the name of a sensor, its times [s] and its accelerations [m/s²].
-    """
+    """First knock by uncorrected and by corrected clocks: (title, [(sensor, s, m/s²)])."""
     shocks = dict(list(calibration.survey.shocks.items())[:MAX_KNOCKS])
     first = min((float(t[s > KNOCK_START * s.max()][0]) for t, s in shocks.values()
                  if len(s) and s.max() > 0.0), default=0.0)
@@ -77,7 +74,6 @@ def _rotations(calibration: Calibration, nominal: SensorNetwork,
 
 
 def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[page.Chart]:
-    """Charts of the first knock and of the rotations about the vertical."""
     for title, curves in _knocks(calibration):
         if curves:
             yield page.Chart(
@@ -95,29 +91,16 @@ def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[page.C
 
 
 def _table(calibration: Calibration) -> page.Table:
-    """Table of the orientation, clock offset and noise of each sensor."""
-    network, rows = calibration.network, list[list[str | float | None]]()
-    for j, name in enumerate(network.names):
-        R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
-        record = network.calibrated[j]
-        has_clock = record is not None and not np.isnan(record.clock_offset_std)
-        rows.append([
-            name, float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))),
-            float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
-            None if std is None else float(np.degrees(std[2])),
-            1e3 * float(network.clock_offset[j]) if has_clock else None,
-            1e3 * record.clock_offset_std if record is not None and has_clock else None,
-            None if noise is None else 1e9 * float(np.nanmean(noise)),
-            'nominal orientation' if record is None else record.by])
-    return page.Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
-                                  'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)
+    return page.Table(
+        'Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]', 'clock [ms]', 'std [ms]',
+                    'noise [nT]', 'source'],
+        [[name, *angles, 1e3 * clock, 1e3 * clock_std,
+          None if noise is None else 1e9 * float(np.nanmean(noise)), source]
+         for name, *angles, clock, clock_std, noise, source in sensor_rows(calibration.network)])
 
 
 def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figure:
-    """Plot the knocks before and after the clock correction, and the yaw of the sensors.
-
-    `nominal` is the network with the orientations of the network file.
-    """
+    """Plot the knocks before and after the clock correction, and the yaw relative to `nominal`."""
     figure = Figure(figsize=(11.0, 4.6), layout='constrained')
     *left, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     for axes, (title, curves) in zip(left, _knocks(calibration), strict=True):
@@ -143,10 +126,7 @@ def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figu
 
 
 def tumble_figure(fits: Mapping[str, EllipsoidFit], readings: Mapping[str, FloatArray]) -> Figure:
-    """Plot a tumble calibration: magnitudes before and after correction, and field directions.
-
-    `readings` (n, 3) are chronological.
-    """
+    """Plot magnitudes before and after correction of `readings` (n, 3), and field directions."""
     figure = Figure(figsize=(10.0, 0.6 + 2.7 * len(fits)), layout='constrained')
     rows = figure.subplots(len(fits), 2, squeeze=False, width_ratios=(1.5, 1.0))
     for (left, right), (name, fit) in zip(rows, fits.items(), strict=True):
@@ -188,7 +168,7 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
         axes.bar(indices, style.SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85',
                  width=0.8, label='uncertainty (90 %, per axis)')
         axes.plot(indices, magnitude, 'o', ms=4, color='tab:blue', label='correction')
-        _set_title(axes, title)
+        axes.set_title(title, fontsize=10, loc='left')
         axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0),
                     frameon=False)
         axes.grid(alpha=0.3)
@@ -207,15 +187,10 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
     return figure
 
 
-def _set_title(axes: Axes, title: str) -> None:
-    """Set the title of axes of a board."""
-    axes.set_title(title, fontsize=10, loc='left')
-
-
 def _mark_one(axes: Axes, title: str) -> None:
     """Set the title, and draw a line at 1, the expected value."""
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
-    _set_title(axes, title)
+    axes.set_title(title, fontsize=10, loc='left')
 
 
 def _plot_displacements(figure: SubFigure, axes: Axes, survey: GeometrySurvey,
@@ -252,14 +227,13 @@ def _plot_displacements(figure: SubFigure, axes: Axes, survey: GeometrySurvey,
     low, high = positions.min(axis=0) - 0.15 * extent, positions.max(axis=0) + 0.15 * extent
     axes.set(xlim=(low[a], high[a]), ylim=(low[b], high[b]), aspect='equal',
              xlabel=f'{"xyz"[a]} [m]', ylabel=f'{"xyz"[b]} [m]')
-    _set_title(axes, 'displacement from the nominal positions')
+    axes.set_title('displacement from the nominal positions', fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=3, loc='upper center', bbox_to_anchor=(0.5, -0.12),
                 frameon=False)
     figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'displacement along {"xyz"[c]} [mm]')
 
 
 def _plot_pose_residuals(axes: Axes, survey: GeometrySurvey) -> None:
-    """Plot the residual of each magnet pose against its row in the table of poses."""
     suspect = np.isin(survey.rows, survey.suspect_rows)
     residual = survey.geometry.pose_residual
     axes.plot(survey.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')

@@ -7,35 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
+from mag_tracking.analysis import signature_classifier as classifier
 from mag_tracking.analysis.signature import Signature
-from mag_tracking.analysis.signature_classifier import (
-    Evaluation,
-    SignatureModel,
-    evaluate,
-    evaluate_splits,
-    feature_table,
-)
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, RecordReceiver, settings_for
+from mag_tracking.recording import signature_tables
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.signature_tables import (
-    LabelledInterval,
-    read_intervals,
-    read_signatures,
-)
 from mag_tracking.records import Readings
 from mag_tracking.run import RecordingSource, run
 
 
 @dataclass(frozen=True)
 class Examples:
-    """Features (n, n_features) of signatures, their origins, and the axes and unit of all of them.
-
-    Labels are empty if unlabelled; signatures of the same target have equal `groups`. There is one
-    message in `unusable` per signature for which no features could be computed.
-    """
+    """Features (n, n_features) of signatures; those of the same target have equal `groups`, and
+    `unusable` has a message for each signature without features."""
 
     x: FloatArray
     labels: tuple[str, ...]
@@ -47,11 +34,10 @@ class Examples:
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
-    """Compute the features of signatures; raises LabelsError if none is usable or axes or units
-    differ."""
+    """Compute features; raises LabelsError if no signature is usable, or axes or units differ."""
     if not signatures:
         raise LabelsError('the input contains no signatures')
-    x, rows, reasons = feature_table(signatures)
+    x, rows, reasons = classifier.feature_table(signatures)
     if not len(rows):
         raise LabelsError(f'no signature is usable; reason for the first: {reasons[0]}')
     usable = [signatures[i] for i in rows.tolist()]
@@ -62,27 +48,19 @@ def examples_of(signatures: list[Signature]) -> Examples:
 def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
                         network: SensorNetwork | None = None, is_labelled: bool = True
                         ) -> list[Signature]:
-    """Read the signatures in a table, or extract them from labelled intervals of a recording.
-
-    A recording requires `labels`, a CSV table of the intervals, and `network`. Raises LabelsError
-    if either is missing, a label is empty, intervals overlap, or an interval contains no readings.
-    """
+    """Read the signatures in a table, or extract them from the intervals in the table `labels` of a
+    recording; raises LabelsError if inputs are missing, contradictory or without readings."""
     if Path(path).suffix.lower() == '.csv' and labels is None:
-        return read_signatures(path, is_labelled)
+        return signature_tables.read_signatures(path, is_labelled)
     if labels is None or network is None:
         raise LabelsError(f'{path}: a recording needs a table of labelled intervals and a network')
     return list(_interval_signatures(Path(path), labels, network))
 
 
 class _CalibratedReadings(RecordReceiver):
-    """Collects calibrated readings."""
-
     def __init__(self) -> None:
         self.batches: list[Readings] = []
-
-    def add_calibrated(self, readings: Readings) -> None:
-        """Store a batch."""
-        self.batches.append(readings)
+        self.add_calibrated = self.batches.append
 
 
 def _interval_signatures(path: Path, labels: str | PathLike[str], network: SensorNetwork
@@ -94,7 +72,7 @@ def _interval_signatures(path: Path, labels: str | PathLike[str], network: Senso
     readings = Readings.joined(sink.batches)
     if not len(readings):
         raise LabelsError(f'{path}: no sensor has calibrated readings')
-    for interval in read_intervals(labels, int(readings.stamp_ns.min())):
+    for interval in signature_tables.read_intervals(labels, int(readings.stamp_ns.min())):
         if interval.sensor and interval.sensor not in network.names:
             raise LabelsError(f'{labels}: row {interval.row}: the network has no sensor '
                               f'{interval.sensor!r}; its sensors are {", ".join(network.names)}')
@@ -104,7 +82,8 @@ def _interval_signatures(path: Path, labels: str | PathLike[str], network: Senso
         yield from signatures
 
 
-def _signatures(path: Path, readings: Readings, interval: LabelledInterval) -> Iterator[Signature]:
+def _signatures(path: Path, readings: Readings, interval: signature_tables.LabelledInterval
+                ) -> Iterator[Signature]:
     """Extract the signatures of one interval, one per sensor with readings in the interval."""
     is_inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
     for j, name in enumerate(readings.names):
@@ -122,21 +101,20 @@ def _signatures(path: Path, readings: Readings, interval: LabelledInterval) -> I
                             f'row {interval.row}')
 
 
-def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,
-                     progress: Callable[[Iterable[int]], Iterable[int]] = iter) -> Evaluation:
-    """Evaluate a trained model, or models trained on `n_splits` stratified splits.
-
-    `progress` wraps the iterable of splits, as `tqdm` does. Raises LabelsError if there are too few
-    examples, or the model has different axes or classes.
-    """
+def evaluate_classes(examples: Examples, model: classifier.SignatureModel | None = None,
+                     n_splits: int = 20,
+                     progress: Callable[[Iterable[int]], Iterable[int]] = iter
+                     ) -> classifier.Evaluation:
+    """Evaluate a trained model, or models trained on `n_splits` stratified splits; raises
+    LabelsError if there are too few examples, or the model has different axes or classes."""
     if model is None:
-        return evaluate_splits(examples.x, examples.labels, examples.groups, examples.axes,
-                               examples.unit, n_splits, progress=progress)
+        return classifier.evaluate_splits(examples.x, examples.labels, examples.groups,
+                                          examples.axes, examples.unit, n_splits, progress=progress)
     check_axes(examples, model)
-    return evaluate(model, examples.x, examples.labels)
+    return classifier.evaluate(model, examples.x, examples.labels)
 
 
-def check_axes(examples: Examples, model: SignatureModel) -> None:
+def check_axes(examples: Examples, model: classifier.SignatureModel) -> None:
     """Raise LabelsError if signatures do not have the axes and the unit of a model."""
     if examples.axes != model.axes:
         raise LabelsError(f'the signatures have the axes {" ".join(examples.axes)}, but the model '

@@ -28,7 +28,6 @@ FIRST_WORKER_TIMEOUT_S = 60.0
 THREAD_START_TIMEOUT_S = 60.0
 NO_WORKERS_TIMEOUT_S = 180.0
 LOCAL_ADDRESS = '127.0.0.1'
-"""Address on which the processes on this machine listen."""
 TLS_VARIABLES = ', '.join(f'DASK_DISTRIBUTED__COMM__TLS__{name}'
                           for name in ('CA_FILE', 'CLIENT__CERT', 'CLIENT__KEY'))
 """Environment variables of Dask with the files for a scheduler at tls://..."""
@@ -49,11 +48,8 @@ class _Task(NamedTuple):
 
 
 class Cluster(Generic[_Key]):
-    """Runs tasks on `workers` processes of this machine, or on the Dask scheduler at an address.
-
-    On exit, unfinished tasks are cancelled. Certificates for tls:// are those of the configuration
-    of Dask (`TLS_VARIABLES`). `n_lost` counts lost workers. Raises ClusterError if the workers do
-    not start, or the scheduler does not respond or has none.
+    """Runs tasks on `workers` processes of this machine, or on the Dask scheduler at an address;
+    raises ClusterError if the workers do not start, or the scheduler does not respond or has none.
     """
 
     def __init__(self, workers: int, scheduler: str | None) -> None:
@@ -104,13 +100,11 @@ class Cluster(Generic[_Key]):
         self._run(_Task(key, priority, task, arguments, False))
 
     def _run(self, task: _Task) -> None:
-        """Submit a task to the scheduler."""
         self._running[self._client.submit(task.call, *task.arguments, pure=False,
                                           priority=task.priority)] = task
 
     def finished(self) -> Iterator[tuple[_Key, Any]]:
-        """Wait up to `POLL_S` for tasks; yield the key and the result or exception of each finished
-        one.
+        """Wait up to `POLL_S`; yield the keys and the results or exceptions of finished tasks.
 
         Raises ClusterError if the scheduler is lost, or there have been no workers for too long.
         """

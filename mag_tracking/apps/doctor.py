@@ -1,33 +1,28 @@
-"""Diagnosis of a network, its readings and the computer that receives them, for `doctor`."""
+"""Diagnosis of a network, its readings and the computer that receives them, with a report."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from html import escape
+from pathlib import Path
 
 import numpy as np
 
 from mag_tracking.calibration.agreement import SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, Step
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.message_block import Progress
 from mag_tracking.records import Readings
+from mag_tracking.report import page
+from mag_tracking.report.style import AXIS_COLOURS
 from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.align.stage import frame_period_warning
-from mag_tracking.stages.calibrate.field_comparison import (
-    compared_with_earth,
-    earth_field_findings,
-)
+from mag_tracking.stages.calibrate import field_comparison
 from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
+from mag_tracking.stages.health import findings
 from mag_tracking.stages.health.clocks import clock_findings
-from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.findings import (
-    background_findings,
-    covariance_findings,
-    driver_findings,
-    rate_findings,
-    rejection_findings,
-    source_findings,
-)
-from mag_tracking.stages.health.sensor_health import SensorHealth
+from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
+from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, SensorHealth
 from mag_tracking.units import NS
 
 STALL_S = 0.25
@@ -94,8 +89,7 @@ class HostStalls:
 
 def load_findings(found: Collection[Finding], sensors: Collection[str], load: float,
                   n_processors: int) -> Iterator[Finding]:
-    """Report a `load` (processes that run or wait) above the number of processors if readings of
-    all sensors are late or lost."""
+    """Report a `load` above the number of processors if all sensors are late or lose readings."""
     late = {f.subject for f in found if f.cause in TIME_CAUSES}
     if load > n_processors and sensors and late.issuperset(sensors):
         yield Finding(False, 'computer', f'{load:.1f} processes compete for '
@@ -107,7 +101,7 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
                      sensors: Mapping[str, SensorHealth]) -> list[Finding]:
     """Diagnose faults that are visible only by comparing the clocks and the fields of sensors."""
     clocks = {name: health.clock for name, health in sensors.items()}
-    findings = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
+    found = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
     backgrounds = calibrate.backgrounds()
     levels = np.array([
         calibrate.background(name) if backgrounds[name].measured
@@ -116,11 +110,11 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     try:
-        return findings + earth_field_findings(compared_with_earth(network, survey, levels))
+        fields = field_comparison.compared_with_earth(network, survey, levels)
+        return found + field_comparison.earth_field_findings(fields)
     except ValueError as error:
-        return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
-                                   'add earth_field or site to the network file',
-                                   Cause.NOT_COMPARED)]
+        return [*found, Finding(False, 'network', f'sensors were not compared: {error}',
+                                'add earth_field or site to the network file', Cause.NOT_COMPARED)]
 
 
 class Doctor:
@@ -177,12 +171,14 @@ class Doctor:
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
-            found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
-            found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
-            found += driver_findings(name, self.calibrate)
-            found += rejection_findings(name, self.calibrate)
-            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
-                                   self._settings.track)
+            found += findings.background_findings(name, self.calibrate,
+                                                  self._frozen_since_ns.get(name))
+            found += findings.covariance_findings(name, self.network.absolute_topics[j],
+                                                  self.calibrate)
+            found += findings.driver_findings(name, self.calibrate)
+            found += findings.rejection_findings(name, self.calibrate)
+            found += findings.rate_findings(name, self.calibrate.lowest_rate(name), self.network,
+                                            self._settings.track)
         for name, missed in self._missed.items():
             for other, n in missed.most_common(1):
                 if n >= MIN_MISSED_TARGETS:
@@ -202,8 +198,35 @@ class Doctor:
 def examine(source: RecordingSource, network: SensorNetwork, settings: Settings,
             progress: Progress | None = None, stopped: Callable[[], bool] | None = None
             ) -> tuple[Doctor, list[Finding]]:
-    """Diagnose a network from a recording that is read by message; return the doctor, and findings
-    about the recording, which it lacks."""
+    """Diagnose a network from a recording; return the doctor, and findings about the recording."""
     doctor = Doctor(Pipeline(network, settings, 'calibrate'))
     run(source, doctor.pipeline, [doctor], progress, stopped)
-    return doctor, source_findings(source.name, source.lost, source.rejected)
+    return doctor, findings.source_findings(source.name, source.lost, source.rejected)
+
+
+def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
+                 path: Path) -> None:
+    """Write the report of `subject`, a recording or network: diagnoses, noise, sample rates."""
+    notes = [page.Note(page.ERROR if d.serious else page.NOTE, str(d))
+             for d in diagnoses] or [page.Note(page.NOTE, 'no faults found')]
+    n_serious = sum(d.serious for d in diagnoses)
+    numbers = (f'{quantity(n_serious, "serious finding")}, '
+               f'{quantity(len(diagnoses) - n_serious, "note")}')
+    names = [escape(name, quote=False) for name in doctor.sensors]
+    noise = [{'type': 'bar', 'x': names, 'name': letter, 'marker': {
+        'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
+        'y': [1e9 * float(h.noise_std[axis]) for h in doctor.sensors.values()]}
+        for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True))]
+    rates = [float(h.rate) if h.counts['readings'] else None for h in doctor.sensors.values()]
+    rows = [[name, h.counts['readings'], rate, h.counts['lost'], h.counts['duplicates'],
+             h.counts['spikes'],
+             None if rate is None else 1e6 * float(np.sqrt(np.nansum(h.field**2))),
+             1e3 * float(h.delay_s[0]) if abs(h.delay_s[0]) < MAX_LIVE_DELAY_S else None]
+            for (name, h), rate in zip(doctor.sensors.items(), rates, strict=True)]
+    charts = [
+        page.Chart('Noise per axis', noise, page.axes('', 'standard deviation [nT]')),
+        page.Chart('Sample rate', [{'type': 'bar', 'x': names, 'y': [rate or 0.0 for rate in rates],
+                                    'showlegend': False}], page.axes('', 'rate [Hz]'))]
+    table = page.Table('Sensors', ['sensor', 'readings', 'rate [Hz]', 'lost', 'duplicates',
+                                   'spikes', 'field [µT]', 'delay [ms]'], rows)
+    page.Page(f'Health of {subject}', numbers, notes, None, charts, [table]).write(path)

@@ -1,7 +1,6 @@
 """Figures and report of fitted passes: fields, model orders, map with time slider."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,24 +14,19 @@ from mag_tracking.quantities import quantity
 from mag_tracking.report import page, style
 from mag_tracking.report.page_scene import field_entry, pose_entry, scene_of
 from mag_tracking.report.road import road_of
-from mag_tracking.results.result_folder import REPORT
 from mag_tracking.units import NS
 
 MAX_SENSORS = 6
-"""Maximum number of sensors in the figure of a pass."""
 RECORDING_GAP_S = 5.0
 """Gap between two recordings on the time axis of the page [s]."""
 N_POSES = 120
-"""Number of poses shown per pass."""
 
 
 def pass_figure(fit: PassFit, title: str) -> Figure:
-    """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
+    """Plot the measured and the fitted field, with 90 % bands, as [TSP14]_ Fig. 6.
 
-    The bands account for the noise and for the uncertainty of the fitted parameters
-    (`PassFit.robust_covariance`). A normalised cost above 1 scales the noise variance, to account
-    for model errors. Only the `MAX_SENSORS` with the strongest fields are plotted. As [TSP14]_ Fig.
-    6.
+    The bands account for the noise and for the uncertainty of the parameters; a normalised cost
+    above 1 scales the noise variance. The `MAX_SENSORS` with the strongest fields are plotted.
     """
     data = fit.data
     background = fit.predicted - _target_field(fit)
@@ -79,11 +73,7 @@ def _target_field(fit: PassFit) -> FloatArray:
 
 
 def order_figure(passes: Sequence[FittedPass]) -> Figure:
-    """Plot the normalised cost against the number of dipoles, one line per pass, as [TSP14]_ Fig.
-    7.
-
-    A filled symbol marks the chosen number of dipoles.
-    """
+    """Plot the normalised cost by number of dipoles, as [TSP14]_ Fig. 7; the chosen is filled."""
     figure = Figure(figsize=(7.5, 5.0), layout='constrained')
     axes = figure.add_subplot()
     for k, one in enumerate(passes):
@@ -105,12 +95,6 @@ def order_figure(passes: Sequence[FittedPass]) -> Figure:
     style.plain_log_ticks(axes)
     figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)', fontsize=11)
     return figure
-
-
-def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
-                 out: Path) -> None:
-    """Write the report of fitted passes, with `RecordingFit.warnings`, to `report.html`."""
-    fit_page(passes, network, warnings).write(out / REPORT)
 
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
@@ -166,7 +150,6 @@ def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
 
 
 def _times(fit: PassFit) -> FloatArray:
-    """Times (n,) [s] of the poses that are shown."""
     return np.linspace(fit.data.t.min(), fit.data.t.max(), N_POSES)
 
 
@@ -197,7 +180,6 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float)
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> page.Chart:
-    """Chart of the normalised cost against the number of dipoles."""
     traces = []
     for k, fitted in enumerate(passes):
         fits = [f for f in fitted.fits if len(f.x)]

@@ -18,7 +18,6 @@ from mag_tracking.recording.sample_reader import fault_of
 from mag_tracking.units import NS
 
 BATCH_SIZE = 4096
-"""Number of messages that are decoded at once."""
 GAP_INTERVALS, MIN_GAP_S = 10.0, 1.0
 """A gap is longer than this number of median intervals, and, if messages come in bursts, than this
 time [s]."""
@@ -54,8 +53,7 @@ class Timing:
         self._sums: FloatArray = np.zeros(64 * _BINS_PER_OCTAVE)
 
     def add(self, times_ns: IntArray, log_times_ns: IntArray) -> None:
-        """Add messages in the order of the recording, by timestamp, or by log time if all stamps
-        are 0."""
+        """Add messages in the order of the recording, by log time if all timestamps are 0."""
         if not len(times_ns):
             return
         self.n_messages += len(times_ns)
@@ -128,11 +126,8 @@ class Timing:
 
 def time_topics(recording: Recording, progress: Callable[[int], object] | None = None
                 ) -> tuple[dict[Source, Timing], 'Counter[str]', 'Counter[str]']:
-    """Compute the statistics of the times of all topics, in order of appearance.
-
-    Sensors that share a topic are separate. The counters are the readings that cannot be decoded,
-    by cause, and the messages that were read, by topic.
-    """
+    """Compute the timing of each topic and sensor; count undecodable readings by cause, and
+    messages by topic."""
     timings: dict[Source, Timing] = {}
     faults: Counter[str] = Counter()
     counts: Counter[str] = Counter()
@@ -190,7 +185,6 @@ def _field_times(block: MessageBlock, topic: str, rows: IntArray, faults: 'Count
 
 def _batch_times(block: MessageBlock, topic: str, rows: IntArray, faults: 'Counter[str]'
                  ) -> Iterator[tuple[Source, IntArray, IntArray]]:
-    """Times of the readings of each sensor in the messages `rows` of a block."""
     for k in rows.tolist():
         message = block.message(k)
         try:

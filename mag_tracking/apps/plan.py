@@ -7,16 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.placement import (
-    DIRECTIONS,
-    STATES,
-    PlannedTarget,
-    Sampling,
-    bounds_of,
-    detection_probabilities,
-    pass_fields,
-    pass_information,
-)
+from mag_tracking.analysis import placement
 from mag_tracking.apps.plan_inputs import Area, LaneLine, plan_inputs
 from mag_tracking.apps.readings import network_of
 from mag_tracking.arrays import FloatArray
@@ -60,9 +51,9 @@ class Plan:
 
     network: SensorNetwork
     """Planned network."""
-    target: PlannedTarget
+    target: placement.PlannedTarget
     """Assumed target."""
-    sampling: Sampling
+    sampling: placement.Sampling
     """Noise and sampling of the sensors."""
     x: FloatArray
     """(nx,) m, coordinates of the maps."""
@@ -165,15 +156,13 @@ def _directions(lanes: Sequence[LaneLine]) -> list[float]:
     return sorted({heading % np.pi for _, heading, _ in lanes})
 
 
-def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-                 lanes: Sequence[LaneLine], area: Area, settings: Settings,
+def compute_plan(network: SensorNetwork, target: placement.PlannedTarget,
+                 sampling: placement.Sampling, lanes: Sequence[LaneLine], area: Area,
+                 settings: Settings,
                  clearance: float = 0.0, n_grid: int = 41,
                  progress: Callable[[int], object] | None = None) -> Plan:
-    """Compute bounds, detection probabilities and the best position of an additional sensor.
-
-    `clearance` [m] is its minimum distance from a lane, and `n_grid` the number of points along the
-    longer side of the maps. `progress` is called with 1 for each of the `n_parts` parts.
-    """
+    """Compute a plan; `clearance` [m] is the distance of an additional sensor from a lane, and
+    `progress` is called with 1 for each of the `n_parts`."""
     report_part = progress or (lambda n: None)
     passes = _Passes(network, target, sampling, settings)
     x, y, points = _grid(area, n_grid)
@@ -211,8 +200,7 @@ def _lane_distances(lane: Lane, points: FloatArray) -> FloatArray:
 
 
 def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coordinates (nx,), (ny,) and points (ny nx, 2) of a map with square cells and `n` points
-    along the longer side."""
+    """Coordinates (nx,), (ny,) and points (ny nx, 2) of a map with square cells."""
     x0, y0, x1, y1 = area
     cell = max(x1 - x0, y1 - y0) / (n - 1)
     x, y = (np.linspace(low, high, max(2, int(round((high - low) / cell)) + 1), dtype=float)
@@ -223,26 +211,27 @@ def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 class _Passes:
     """Passes of a target over a network, for all directions of its moment."""
 
-    def __init__(self, network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-                 settings: Settings) -> None:
+    def __init__(self, network: SensorNetwork, target: placement.PlannedTarget,
+                 sampling: placement.Sampling, settings: Settings) -> None:
         self.network, self.target, self.sampling, self.settings = (
             network, target, sampling, settings)
         self.poses, self.prior = (network.positions, network.R_sw), target.prior()
 
     def information(self, points: FloatArray, heading: float) -> FloatArray:
         """Information (n, 7, 9, 9) of all sensors about passes through points (n, 2)."""
-        return np.asarray(pass_information(*self.poses, self.target, self.sampling, points,
-                                           heading).sum(axis=2))
+        return np.asarray(placement.pass_information(*self.poses, self.target, self.sampling,
+                                                     points, heading).sum(axis=2))
 
     def bounds(self, points: FloatArray, heading: float) -> FloatArray:
         """Bounds (n, 7, 3) of position, velocity and moment of passes through points (n, 2)."""
-        return bounds_of(self.information(points, heading), self.prior)
+        return placement.bounds_of(self.information(points, heading), self.prior)
 
     def detection(self, points: FloatArray) -> FloatArray:
         """Detection probability (n, 7) of one frame with the target at points (n, 2)."""
         detect = self.settings.detect
-        return detection_probabilities(*self.poses, self.target, self.sampling, points,
-                                       detect.false_alarm_probability, detect.background_std)
+        return placement.detection_probabilities(
+            *self.poses, self.target, self.sampling, points, detect.false_alarm_probability,
+            detect.background_std)
 
     def points(self, heading: float, offset: float, along: FloatArray) -> FloatArray:
         """Points (n, 2) [m] of a lane at the distances `along` (n,) from the centre."""
@@ -252,7 +241,6 @@ class _Passes:
         return points
 
     def lane(self, name: str, heading: float, offset: float, area: Area) -> Lane:
-        """Compute bounds and detection probabilities along one lane."""
         half_length = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
         n = int(np.clip(half_length / (self.target.speed * self.sampling.period), 10, 60))
         along = np.linspace(-half_length, half_length, 2 * n + 1)
@@ -261,12 +249,9 @@ class _Passes:
                     self._filter_bound(points, heading), self.detection(points).mean(axis=1))
 
     def _filter_bound(self, points: FloatArray, heading: float) -> FloatArray:
-        """Position bound (n,) [m] at each point of a lane of a filter that starts at the first
-        point.
-
-        The filter uses the motion model of the tracker and estimates the backgrounds. The bound is
-        the median over the directions of the moment.
-        """
+        """Position bound (n,) [m] on a lane of a filter that starts at its first point, with the
+        motion model of the tracker and unknown backgrounds; median over the directions of the
+        moment."""
         target, sampling, n_sensors = self.target, self.sampling, len(self.network)
         dt = np.hypot(*(points[1] - points[0])) / target.speed
         n_x = 9 + 3 * n_sensors
@@ -281,14 +266,14 @@ class _Passes:
         P0 = np.diag(np.concatenate([
             prior_std**2, np.full(3, target.moment**2 / 3.0),
             np.full(3 * n_sensors, min(sampling.background_std, 1e-6)**2)]))
-        _, h, H = zip(*pass_fields(
-            *self.poses, target, Sampling(sampling.period, sampling.noise_std, half_window=0.0),
-            points, heading), strict=True)
+        instant = placement.Sampling(sampling.period, sampling.noise_std, half_window=0.0)
+        _, h, H = zip(*placement.pass_fields(*self.poses, target, instant, points, heading),
+                      strict=True)
         h, H = np.concatenate(h), np.concatenate(H)
-        std = np.empty((len(points), len(DIRECTIONS)))
+        std = np.empty((len(points), len(placement.DIRECTIONS)))
         backgrounds = np.broadcast_to(np.eye(3 * n_sensors).reshape(n_sensors, 3, -1),
                                       (len(points), n_sensors, 3, 3 * n_sensors))
-        for d in range(len(DIRECTIONS)):
+        for d in range(len(placement.DIRECTIONS)):
             variance = (np.square(sampling.noise_std) + sampling.field_error**2 * np.square(
                 h[:, d, 0]).sum(axis=-1)) / (dt / sampling.period)
             P = path_bound(F, Q, np.concatenate([H[:, d, 0], backgrounds], axis=-1),
@@ -308,27 +293,25 @@ class _Passes:
         bounds_without, bounds_with = [], []
         for heading, points in near_lanes:
             J = self.information(points, heading)
-            bounds_without.append(bounds_of(J, self.prior)[..., 0].ravel())
-            added_information = pass_information(added, np.tile(np.eye(3), (n, 1, 1)), self.target,
-                                                 sampling, points, heading)
-            bounds_with.append(bounds_of(J[:, :, None] + added_information, self.prior)[
+            bounds_without.append(placement.bounds_of(J, self.prior)[..., 0].ravel())
+            added_information = placement.pass_information(
+                added, np.tile(np.eye(3), (n, 1, 1)), self.target, sampling, points, heading)
+            bounds_with.append(placement.bounds_of(J[:, :, None] + added_information, self.prior)[
                 ..., 0].reshape(-1, n))
         return (float(np.median(np.concatenate(bounds_without))),
                 np.median(np.concatenate(bounds_with), axis=0))
 
     def closest_point(self, lane: Lane, distance_scale: float
                       ) -> tuple[Observability, dict[str, FloatArray]]:
-        """Compute `Plan.observability`, in units of `distance_scale` [m], and
-        `bounds_at_closest`."""
+        """Compute `Plan.observability`, scaled by `distance_scale` [m], and `bounds_at_closest`."""
         J = self.information(lane.points[np.argmin(np.abs(lane.along))][None], lane.heading)[0]
         scale = np.repeat([max(distance_scale, 1e-3), self.target.speed, self.target.moment], 3)
-        return (observability(J[3], STATES, scale),
-                {'with prior': np.median(bounds_of(J, self.prior), axis=0),
-                 'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
+        return (observability(J[3], placement.STATES, scale),
+                {'with prior': np.median(placement.bounds_of(J, self.prior), axis=0),
+                 'without prior': np.median(placement.bounds_of(J, np.zeros((9, 9))), axis=0)})
 
     def miss_curve(self, lane: Lane, area: Area) -> FloatArray:
-        """Compute `Plan.miss_curve`: `detect.onset_frames` consecutive frames must detect the
-        target."""
+        """Compute `Plan.miss_curve`: `detect.onset_frames` consecutive frames must detect."""
         half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
         n = int(np.clip(4.0 * half_length / (self.target.speed * self.sampling.period), 1,
                         MAX_FRAMES))

@@ -65,20 +65,17 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None,
 
 
 def _in_range(name: str, value: float, low: float, high: float) -> float:
-    """Return `value`; raises SettingsError if it is out of range."""
     if not low <= value <= high:
         raise SettingsError(f'{name}: expected {low:g} to {high:g}, got {value:g}')
     return value
 
 
 def _to_floats(values: Sequence[float] | None) -> list[float] | None:
-    """Convert the values of a list or array to float."""
     return None if values is None else [float(v) for v in values]
 
 
 def _target(vehicle: VehicleSettings, target: str | None, moment: float | None,
             height: float | None, speed: float) -> PlannedTarget:
-    """Create the target from its kind, or from its moment and height."""
     _in_range('speed', speed, 1e-4, 1e3)
     if height is not None:
         _in_range('height', height, -1e3, 1e3)

@@ -52,10 +52,7 @@ def detection_figure(plan: Plan) -> Figure:
 
 
 def sensor_figure(plan: Plan) -> Figure:
-    """Map of the reduction [%] of the median position bound by an additional sensor at each point.
-
-    The map is white where no sensor is allowed.
-    """
+    """Map of the reduction [%] of the bound by an additional sensor; white if not allowed."""
     figure, axes, f, unit = _draw_map(
         plan, 'Improvement by one additional sensor\n(median bound near the sensors without it: '
         f'{length_text(plan.std_without_added_sensor)})')
@@ -138,10 +135,7 @@ def length_text(metres: float) -> str:
 
 
 def _distinct_lanes(lanes: Sequence[Lane]) -> list[tuple[str, Lane]]:
-    """Group lanes with identical curves, which would overlap in a plot.
-
-    Return the combined names of each group, and its first lane.
-    """
+    """Group lanes with identical curves: their combined names, and the first lane."""
     out: list[tuple[list[str], Lane]] = []
     for lane in lanes:
         for names, other in out:
@@ -211,7 +205,6 @@ def summary_lines(p: Plan) -> list[str]:
 
 
 def _maps(plan: Plan) -> list[page.Chart]:
-    """Maps of position bound, detection probability and gain of an additional sensor."""
     f, unit = style.scale_of(np.ptp(plan.x))
     layout = page.axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
     x, y = f * plan.x, f * plan.y
@@ -219,7 +212,10 @@ def _maps(plan: Plan) -> list[page.Chart]:
     low, high = np.nanquantile(bound, [LOW_QUANTILE, 1.0 - LOW_QUANTILE])
     position = page.heat_map(x, y, bound, 'Viridis', f'standard deviation [{unit}]', float(low),
                         float(high))
-    position['colorbar'] |= _log_ticks(low, high)
+    # The colour bar labels the logarithmic values with linear numbers.
+    ticks = [v for v in ROUND_NUMBERS if low <= np.log10(v) <= high] or [10.0**(0.5 * (low + high))]
+    position['colorbar'] |= {'tickvals': np.log10(ticks).tolist(),
+                             'ticktext': [f'{v:.3g}' for v in ticks]}
     position |= {'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
                  'hoverinfo': 'x+y+text'}
     gain_x, gain_y, gain = _gain(plan, f)
@@ -237,13 +233,6 @@ def _maps(plan: Plan) -> list[page.Chart]:
     return charts
 
 
-def _log_ticks(low: float, high: float) -> dict[str, Any]:
-    """Create the ticks of a colour bar that label logarithmic values with linear numbers."""
-    ticks = [v for v in ROUND_NUMBERS if low <= np.log10(v) <= high] or [
-        10.0 ** (0.5 * (low + high))]
-    return {'tickvals': np.log10(ticks).tolist(), 'ticktext': [f'{v:.3g}' for v in ticks]}
-
-
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
     """Traces of the lanes and sensors on a map whose coordinates are scaled by `f`."""
     traces: list[dict[str, Any]] = [
@@ -255,7 +244,6 @@ def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
 
 
 def _lanes(plan: Plan) -> list[page.Chart]:
-    """Charts of position bound and detection probability along the lanes, and of missed passes."""
     f, unit = style.scale_of(np.ptp(plan.x))
     bounds, detection = [], []
     for k, (name, lane) in enumerate(_distinct_lanes(plan.lanes)):

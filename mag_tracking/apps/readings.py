@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 MAX_DELAY_S = 10.0
 """Delay above which a reading is considered unsorted rather than delayed [s]."""
 UNITS_NS = {'s': 1_000_000_000, 'ms': 1_000_000, 'us': 1_000, 'ns': 1}
-"""Nanoseconds per unit of time."""
 TIME_COLUMNS = ('stamp_ns', 'time', 'timestamp', 't')
 """Accepted names of the column with the times; without one, the index must contain datetimes."""
 AXES = ('x', 'y', 'z')
@@ -175,10 +174,7 @@ def _with_nan(values: ArrayLike) -> NDArray[Any]:
 
 
 def _checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
-    """Check readings and convert them to the array types that the stages expect.
-
-    Raises ReadingsError if shapes or types are wrong, or no reading belongs to the network.
-    """
+    """Convert readings to the types of the stages; raises ReadingsError if none is usable."""
     readings = _to_standard_types(readings)
     if len(readings) and not set(readings.names) & set(network.names):
         raise ReadingsError(f'no reading is from a sensor of the network: the readings are from '
@@ -331,7 +327,6 @@ def readings_of_table(table: 'pd.DataFrame', time_unit: str | None,
 
 
 def _check_axes(present: Container[Any], label: str, columns: Iterable[Any]) -> None:
-    """Raise ReadingsError unless all axes are present."""
     missing = [axis for axis in AXES if axis not in present]
     if missing:
         raise ReadingsError(f'{label}no column for {", ".join(missing)}: add one with NaN for an '
@@ -394,6 +389,5 @@ def _in_order(names: tuple[str, ...], sensor: IntArray, stamp_ns: IntArray,
 
 
 def _listed(columns: Iterable[Any]) -> str:
-    """Names of columns for a message."""
     names = [str(column) for column in columns]
     return ', '.join(names[:20]) + (' ...' if len(names) > 20 else '') or 'none'

@@ -3,12 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from mag_tracking.messages.types import (
-    CALIBRATED_READINGS,
-    CALIBRATION_STATE,
-    NETWORK_FRAME,
-    RAW_READINGS,
-)
+from mag_tracking.messages import types
 from mag_tracking.quantities import quantity
 
 if TYPE_CHECKING:
@@ -16,24 +11,21 @@ if TYPE_CHECKING:
 
 
 class Selection(NamedTuple):
-    """Topics to record; names may be relative, but are absolute in the result of `resolved`."""
+    """Topics to record; names may be relative, but are absolute in the result of `resolved`.
+
+    They are those of the fields, and of sensor_msgs/Imu, of the sensors of the network, `topics`,
+    and with `results` or `all_topics` those of the nodes, or all.
+    """
 
     fields: tuple[str, ...] = ()
-    """Magnetic-field topics of the network."""
     imus: tuple[str, ...] = ()
-    """Topics on which the sensors of the network may publish sensor_msgs/Imu."""
     topics: tuple[str, ...] = ()
-    """Other topics to record."""
     results: bool = False
-    """Whether to record the results of the nodes."""
     all_topics: bool = False
-    """Whether to record all topics."""
-    readings: str = RAW_READINGS
-    """Topic with the readings of many sensors."""
+    readings: str = types.RAW_READINGS
     result_prefixes: tuple[str, ...] = ('calibration_node/', 'detection_node/', 'tracker_node/')
-    """Prefixes of result topics."""
-    result_topics: tuple[str, ...] = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-    """Other result topics."""
+    result_topics: tuple[str, ...] = (types.CALIBRATED_READINGS, types.CALIBRATION_STATE,
+                                      types.NETWORK_FRAME)
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
         """Selection with absolute names of topics, which `resolve` returns."""

@@ -8,18 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from mag_tracking.analysis import track_errors
 from mag_tracking.analysis.correlated_motion import contradicts_delays, correlated_motion
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.analysis.track_errors import (
-    MAGNET_SKIP,
-    Truth,
-    error_over_bound,
-    interpolate_truth,
-    magnet_errors,
-    near_poses,
-    pass_errors,
-    unflagged_poses,
-)
 from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError
@@ -48,7 +39,6 @@ from mag_tracking.stages.track.settings import acceleration_density
 SUSPECT_MOUNTING_RATIO = 2.0
 """Mounting error above which a sensor is reported, in prior standard deviations."""
 MAX_FIGURES = 6
-"""Maximum number of tracks that are drawn."""
 
 
 @dataclass
@@ -58,12 +48,9 @@ class Run:
     summary: dict[str, Any]
     """Content of `summary.json`."""
     report: RunReport
-    """Losses, rejections and missing topics, with their causes."""
     logs: dict[int, TrackLog] = field(default_factory=dict)
-    """{track id: history of the track}."""
     smoothed: dict[int, SmoothedLog] = field(default_factory=dict)
-    """{track id: history of the smoothed track}."""
-    truth: dict[str, Truth] = field(default_factory=dict)
+    truth: dict[str, track_errors.Truth] = field(default_factory=dict)
     """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}."""
 
 
@@ -74,12 +61,10 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            more_sinks: Callable[[Pipeline], Sequence[Sink]] = lambda pipeline: ()) -> Run:
     """Track the targets in a recording and write the results to the folder `out`.
 
-    `progress` is called with the number of bytes read since the last call. `stopped` is called
-    after every batch of readings and every progress report; when it returns true, partial results
-    are written and the summary is marked as interrupted. `report` is called with a message if the
-    results of an earlier run are replaced. `truth` is a CSV file (`recording.truth`), or a topic
-    with messages of type PoseStamped, PoseWithCovarianceStamped or Odometry, by default all topics
-    below /ground_truth. `more_sinks` is called with the pipeline and returns more sinks of the run.
+    `progress`, `stopped`: see `run`; the summary of a stopped run is marked as interrupted.
+    `report` is called if results of an earlier run are replaced. `truth` is a CSV file, or a topic
+    of poses or odometry, by default all below /ground_truth. `more_sinks` are created from the
+    pipeline.
 
     Raises RecordingError if the recording has none of the network's topics or the ground truth
     cannot be read, OutputError if `out` is the folder of the recording.
@@ -141,7 +126,7 @@ class TrackHistory(RecordReceiver):
 
 
 def summarise(source: Source, pipeline: Pipeline, history: TrackHistory,
-              truth: Mapping[str, Truth], report: RunReport) -> dict[str, Any]:
+              truth: Mapping[str, track_errors.Truth], report: RunReport) -> dict[str, Any]:
     """Content of `summary.json` after a run; `truth` is {target: (stamps, positions, ...)}."""
     sensors: dict[str, dict[str, Any]] = {}
     for name, background in pipeline.calibrate.backgrounds().items():
@@ -171,15 +156,14 @@ def summarise(source: Source, pipeline: Pipeline, history: TrackHistory,
             'clocks_apart': pipeline.track.clock_warning,
             'missing_topics': list(report.missing_topics), 'sensors': sensors, 'tracks': tracks,
             'disturbances': [asdict(d) for d in history.disturbances.values()],
-            'unflagged_poses': unflagged_poses(history.logs.values(), truth.values())
+            'unflagged_poses': track_errors.unflagged_poses(history.logs.values(), truth.values())
             if truth and pipeline.settings.track.target == 'vehicle' else None,
             'interrupted': report.interrupted,
             'not_written': [str(failure.error) for failure in report.failures]}
 
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,
-                 truth: Mapping[str, Truth]) -> dict[str, Any]:
-    """Create the entry of a track in the summary."""
+                 truth: Mapping[str, track_errors.Truth]) -> dict[str, Any]:
     entry: dict[str, Any] = log.summary()
     network, settings = pipeline.network, pipeline.settings
     entry['nis_by_sensor'] = log.nis_of(network.names)
@@ -215,32 +199,30 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
 
 
 def errors_against_truth(log: TrackLog | SmoothedLog, network: SensorNetwork, settings: Settings,
-                         truth: Mapping[str, Truth]) -> dict[str, Any] | None:
-    """Errors of a track relative to the best-matching target of the ground truth.
-
-    The result is the entry `truth` of the track in `summary.json`; None if no ground truth covers
-    it.
-    """
+                         truth: Mapping[str, track_errors.Truth]) -> dict[str, Any] | None:
+    """Entry `truth` of a track in `summary.json`: errors relative to the best-matching target; None
+    if no ground truth covers the track."""
     found: list[tuple[float, dict[str, Any]]] = []
     for name, true in truth.items():
         if settings.track.target == 'magnet':
-            if magnet := magnet_errors(log, true, settings.track.magnet.axis):
+            if magnet := track_errors.magnet_errors(log, true, settings.track.magnet.axis):
                 found.append((magnet['position_mean'], {'name': name, **magnet}))
-        elif vehicle := pass_errors(log, true, network.centre):
+        elif vehicle := track_errors.pass_errors(log, true, network.centre):
             found.append((vehicle['closest'], {'name': name, **vehicle}))
     return min(found, key=lambda errors: errors[0])[1] if found else None
 
 
-def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
+def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: track_errors.Truth) -> float | None:
     """Ratio of the error of a track to its Cramér-Rao bound; None if it cannot be computed."""
     network, track = pipeline.network, pipeline.settings.track
     rows: IntArray
     if track.target == 'magnet':
         # Between two poses, the magnet may have rotated arbitrarily.
-        rows, drift, n_axes = np.arange(MAGNET_SKIP, len(log.stamp_ns)), 1.0, 3
+        rows, drift, n_axes = np.arange(track_errors.MAGNET_SKIP, len(log.stamp_ns)), 1.0, 3
     else:
-        rows, drift, n_axes = near_poses(log, truth, network.centre), track.vehicle.moment_drift, 2
-    return error_over_bound(network, log, truth, acceleration_density(track), drift,
+        rows = track_errors.near_poses(log, truth, network.centre)
+        drift, n_axes = track.vehicle.moment_drift, 2
+    return track_errors.error_over_bound(network, log, truth, acceleration_density(track), drift,
                             track.field_error, track.background_std, rows, n_axes)
 
 
@@ -267,7 +249,7 @@ def write_figures(run: Run, network: SensorNetwork, out: Path,
         entry = next(t for t in run.summary['tracks'] if t['id'] == log.id)
         truth = None
         if 'truth' in entry:
-            truth = interpolate_truth(run.truth[entry['truth']['name']], log.stamp_ns)
+            truth = track_errors.interpolate_truth(run.truth[entry['truth']['name']], log.stamp_ns)
         smoothed = run.smoothed[log.id].position if log.id in run.smoothed else None
         for name, figure in (('map', map_figure(log, network, truth, smoothed)),
                              ('weights', weights_figure(log)),

@@ -92,7 +92,6 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
-    """Table of the background, readings, noise and position of each sensor."""
     innovations = [t['nis_by_sensor'] for t in summary['tracks']]
     rows = []
     for j, (name, s) in enumerate(summary['sensors'].items()):
@@ -110,12 +109,12 @@ def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
     """Create the notes on a replay from the content of `summary.json`."""
-    return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
-            *(Note(NOTE, _describe_disturbance(d)) for d in summary['disturbances'])]
+    return [*_notes(summary), *(Note(NOTE, _describe_disturbance(d))
+                                for d in summary['disturbances'])]
 
 
-def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on the diagnoses and the initial backgrounds."""
+def _notes(summary: Mapping[str, Any]) -> Iterator[Note]:
+    """Notes on diagnoses and backgrounds, limitations of the tracks, and wrong poses."""
     for diagnosis in summary['diagnoses']:
         yield Note(WARNING if diagnosis['serious'] else NOTE, diagnosis['text'])
     for name, s in summary['sensors'].items():
@@ -123,10 +122,6 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
             begin, end = s['quiet_stretch_s']
             yield Note(NOTE, f'no quiet interval at the start: the most frequent level of '
                        f'{name}, from {begin:.1f} to {end:.1f} s, is used as its background')
-
-
-def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on the limitations of the tracks, with causes."""
     counts = summary['counts']['track']
     reason = no_track_reason(counts)
     if reason:
@@ -146,10 +141,6 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     for cause, one, several, text in COUNTED:
         if n := counts.get(cause, 0):
             yield Note(WARNING, quantity(n, one, several) + text)
-
-
-def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Note on the number of unambiguous poses that are wrong."""
     poses = summary['unflagged_poses']
     if poses and poses['n']:
         yield Note(NOTE, f'unambiguous poses: {poses["n"]}, of which {poses["wrong"]} '
@@ -160,7 +151,6 @@ def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
 
 
 def _describe_disturbance(d: Mapping[str, Any]) -> str:
-    """Describe the duration, amplitude and extent of a disturbance in one sentence."""
     duration = (d['stamp_ns'] - d['begin_ns']) / NS
     extent = 'uniform over the network' if d['uniform'] > 0.5 else 'different at each sensor'
     return (f'disturbance {d["id"]}: {duration:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '

@@ -16,14 +16,8 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.records import Detection, SmoothedPose, Track
+from mag_tracking.results import dataframes
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
-from mag_tracking.results.dataframes import (
-    array_dataframe,
-    detection_array,
-    pose_array,
-    smoothed_array,
-    with_time_index,
-)
 from mag_tracking.run import DisplayedResult, RunReport, progress_bar, run
 
 if TYPE_CHECKING:
@@ -79,7 +73,7 @@ class TrackingResult(DisplayedResult):
         pandas.DataFrame
             Columns of `poses.csv`, indexed by time (UTC).
         """
-        return with_time_index(self.poses_dataframe(), 'stamp_ns')
+        return dataframes.with_time_index(self.poses_dataframe(), 'stamp_ns')
 
     def figure(self) -> 'Figure':
         """Draw the pass of the first vehicle, or the map of the first magnet.
@@ -99,7 +93,7 @@ class TrackingResult(DisplayedResult):
         pandas.DataFrame
             Columns of `poses.csv`.
         """
-        return array_dataframe(POSES, self.poses)
+        return dataframes.array_dataframe(POSES, self.poses)
 
     def smoothed_dataframe(self) -> 'pd.DataFrame':
         """Convert `smoothed` to a table.
@@ -109,7 +103,7 @@ class TrackingResult(DisplayedResult):
         pandas.DataFrame
             Table with the columns of `poses_smoothed.csv`, and `complete`.
         """
-        return array_dataframe((*SMOOTHED, *COMPLETE), self.smoothed)
+        return dataframes.array_dataframe((*SMOOTHED, *COMPLETE), self.smoothed)
 
     def detections_dataframe(self) -> 'pd.DataFrame':
         """Convert `detections` to a table.
@@ -119,7 +113,7 @@ class TrackingResult(DisplayedResult):
         pandas.DataFrame
             Table with the columns of `detections.csv`.
         """
-        return array_dataframe(DETECTIONS, self.detections)
+        return dataframes.array_dataframe(DETECTIONS, self.detections)
 
     def errors(self, track_id: int | None = None) -> dict[str, Any] | None:
         """Compute the errors of a track relative to the best-matching target of the ground truth.
@@ -168,7 +162,7 @@ class TrackingResult(DisplayedResult):
         -------
         matplotlib.figure.Figure
         """
-        from mag_tracking.report.pass_picture import pass_figure
+        from mag_tracking.report.figures import pass_figure
 
         log = self._track_log(track_id)
         return pass_figure(log, self.network, self._smoothed_path(log.id), max_std)
@@ -265,26 +259,22 @@ def track(source: UserSource,
     opened = source_of(source, network, time_unit)
     with progress_bar(opened, leave=False) as bar:
         report = run(opened, pipeline, [found], bar.update)
-    return TrackingResult(network, pipeline.settings, pose_array(found.poses),
-                          smoothed_array(found.smoothed_poses), detection_array(found.detections),
-                          found.logs, opened.truth(), report, tuple(found.disturbances.values()))
+    return TrackingResult(
+        network, pipeline.settings, dataframes.pose_array(found.poses),
+        dataframes.smoothed_array(found.smoothed_poses),
+        dataframes.detection_array(found.detections), found.logs, opened.truth(), report,
+        tuple(found.disturbances.values()))
 
 
 class _Poses(TrackHistory):
-    """Also stores detections and poses."""
-
     def __init__(self) -> None:
         super().__init__()
         self.poses: list[Track] = []
         self.smoothed_poses: list[SmoothedPose] = []
         self.detections: list[Detection] = []
-
-    def add_detection(self, detection: Detection) -> None:
-        """Add the onset or release of a detection."""
-        self.detections.append(detection)
+        self.add_detection = self.detections.append
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Add a smoothed pose."""
         super().add_smoothed(pose)
         self.smoothed_poses.append(pose)
 

@@ -1,7 +1,8 @@
-"""Traffic in a recording: passages across counting lines, and passes at each sensor."""
+"""Traffic in a recording: passages across counting lines, the recognition of enrolled vehicles, and
+passes at each sensor."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -15,15 +16,18 @@ from mag_tracking.analysis.correlated_motion import (
 )
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.readings import UserSource, network_of, source_of
-from mag_tracking.errors import SettingsError
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import LabelsError, NetworkError, SettingsError
 from mag_tracking.event_records import PassEvent, TrafficSummary, VehiclePassage
+from mag_tracking.inference import identification
 from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.records import FieldFrame, Readings, Track
 from mag_tracking.results.columns import EVENTS, row_of, traffic_tables
 from mag_tracking.results.dataframes import rows_dataframe
-from mag_tracking.results.traffic_tables import passage_row
+from mag_tracking.results.traffic_tables import FleetPass, passage_row
 from mag_tracking.run import DisplayedResult, RunReport, progress_bar, run
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.units import NS
@@ -55,8 +59,12 @@ class CountedVehicle:
     def speeds_contradict(self) -> bool:
         """Whether the speed or direction of the track contradicts the delays."""
         p = self.passage
-        heading = float(np.arctan2(p.velocity[1], p.velocity[0]))
-        return contradicts_delays((p.speed, p.speed_std), (heading, p.heading_std), self.delay)
+        return contradicts_delays((p.speed, p.speed_std), (_heading(p), p.heading_std), self.delay)
+
+
+def _heading(passage: VehiclePassage) -> float:
+    """Heading of a passage, anticlockwise from x [rad]."""
+    return float(np.arctan2(passage.velocity[1], passage.velocity[0]))
 
 
 @dataclass(frozen=True)
@@ -153,10 +161,8 @@ def check_vehicles(settings: Settings) -> None:
 
 
 class TrafficSink(RecordReceiver):
-    """Collects passages and summaries; stores the frames of tracks to compute the delays.
-
-    Raises SettingsError if the target is not a vehicle.
-    """
+    """Collects passages and summaries, and the frames of tracks for the delays; raises
+    SettingsError if the target is not a vehicle."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         check_vehicles(pipeline.settings)
@@ -167,6 +173,7 @@ class TrafficSink(RecordReceiver):
         self._frames: dict[int, list[FieldFrame]] = {}
         self._vehicles: list[CountedVehicle] = []
         self._summaries: list[TrafficSummary] = []
+        self.add_traffic = self._summaries.append
 
     def add_frame(self, frame: FieldFrame) -> None:
         """Store the frame of the following poses."""
@@ -182,10 +189,6 @@ class TrafficSink(RecordReceiver):
     def add_passage(self, passage: VehiclePassage) -> None:
         """Add a passage with the velocity from the delays."""
         self._vehicles.append(CountedVehicle(passage, self._delay_motion(passage.track_id)))
-
-    def add_traffic(self, summary: TrafficSummary) -> None:
-        """Add a summary."""
-        self._summaries.append(summary)
 
     def result(self, report: RunReport) -> TrafficResult:
         """Return the counted vehicles after a run."""
@@ -214,6 +217,49 @@ class TrafficSink(RecordReceiver):
         return correlated_motion(PassData.from_frames(
             self._network, [f.stamp_ns for f in frames], [f.field for f in frames],
             [f.covariance for f in frames], [f.time_offset for f in frames]))
+
+
+def earth_field_strength(network: SensorNetwork) -> FloatArray:
+    """Field strength (3,) of the Earth [A/m], world frame; raises NetworkError if unknown."""
+    if network.earth_field is None or not network.earth_field.any():
+        raise NetworkError('hard and soft iron cannot be separated without the field of the Earth: '
+                           'add earth_field to the network file')
+    return network.earth_field / MU0
+
+
+def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
+    """Convert the only passage in a recording to a pass for the enrolment of a vehicle; raises
+    LabelsError if there is not exactly one passage, or it is ambiguous."""
+    if len(passages) != 1:
+        raise LabelsError(f'{recording}: expected exactly one vehicle to enrol, but '
+                          f'{len(passages)} crossed a line')
+    (p,) = passages
+    if p.ambiguous:
+        raise LabelsError(f'{recording}: the passage is ambiguous ({", ".join(p.doubts)}); record '
+                          'another passage')
+    return FleetPass(p.moment, p.moment_covariance, _heading(p), f'{recording} {p.number}')
+
+
+class Fleet:
+    """Enrolled vehicles of one site, from the passes of each; raises LabelsError if a vehicle
+    cannot be enrolled, NetworkError if the Earth's field is unknown."""
+
+    def __init__(self, passes: dict[str, list[FleetPass]], network: SensorNetwork) -> None:
+        self._field_strength = earth_field_strength(network)
+        self.vehicles: list[identification.EnrolledVehicle] = []
+        for name, vehicle_passes in passes.items():
+            try:
+                self.vehicles.append(identification.enrol(
+                    name, np.array([p.moment for p in vehicle_passes]).reshape(-1, 3),
+                    np.array([p.covariance for p in vehicle_passes]).reshape(-1, 3, 3),
+                    np.array([p.heading for p in vehicle_passes]), self._field_strength))
+            except ValueError as error:
+                raise LabelsError(str(error)) from error
+
+    def identify(self, passage: VehiclePassage) -> identification.Identification:
+        """Identify the vehicle of a passage."""
+        return identification.identify(self.vehicles, passage.moment, passage.moment_covariance,
+                        _heading(passage), passage.heading_std, self._field_strength)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,18 +10,16 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step
 from mag_tracking.recording.message_block import Progress
 from mag_tracking.recording.reader import Recording
-from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
+from mag_tracking.records import Readings, SmoothedPose
 from mag_tracking.report.page import NOTE, WARNING, Note, Table
 from mag_tracking.run import RecordingSource, Source, run
 from mag_tracking.units import NS
 from mag_tracking.web.live_scene import LiveScene
 
 BATCH_S = 0.05
-"""Duration of a batch of readings [s]."""
 MAX_WAIT_S = 5.0
 """Maximum wait during a gap in a recording [s]."""
 HEALTH_INTERVAL_S = 1.0
-"""Interval between updates of the sensor health [s]."""
 
 
 def view(recording: Recording, network: SensorNetwork, settings: Settings, scene: LiveScene,
@@ -40,7 +38,6 @@ class _PacedSource(RecordingSource):
         self._rate, self._stopped = rate, stopped
 
     def batches(self, progress: Progress | None = None) -> Iterator[tuple[Readings, int | None]]:
-        """Yield each batch when it is due."""
         due, last_log_ns = time.monotonic(), None
         for readings, log_ns in _joined(self.reader.readings_as_received(progress)):
             # Log times set the pace, because one wrong sensor timestamp could stop the playback.
@@ -74,11 +71,10 @@ class _SceneSink(RecordReceiver):
     def __init__(self, scene: LiveScene, pipeline: Pipeline, source: Source,
                  stopped: Callable[[], bool]) -> None:
         self._scene, self._pipeline, self._source = scene, pipeline, source
-        self._stopped = stopped
+        self._stopped, self.add_frame, self.add_track = stopped, scene.add_frame, scene.add_track
         self._health_due, self._smoothed = 0.0, dict[int, list[FloatArray]]()
 
     def add(self, step: Step) -> None:
-        """Add the records of a step, and the health if it is due."""
         self._smoothed.clear()
         self.receive(step.records)
         for track_id, points in self._smoothed.items():
@@ -89,21 +85,11 @@ class _SceneSink(RecordReceiver):
             self._health_due = time.monotonic() + HEALTH_INTERVAL_S
             self._update_health([])
 
-    def add_frame(self, frame: FieldFrame) -> None:
-        """Add a frame to the scene."""
-        self._scene.add_frame(frame)
-
-    def add_track(self, track: Track) -> None:
-        """Add a pose to the scene."""
-        self._scene.add_track(track)
-
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Store a pose of a track that is smoothed over its whole length."""
         if pose.complete:
             self._smoothed.setdefault(pose.id, []).append(pose.position)
 
     def _update_health(self, notes: list[Note]) -> None:
-        """Update the notes and the table of sensors."""
         pipeline, source = self._pipeline, self._source
         not_used = {**source.rejected, **pipeline.rejections()}
         notes = [*notes,

@@ -14,7 +14,6 @@ from mag_tracking.interrupts import exit_on_signals
 from mag_tracking.nodes.start import limit_exit_time
 
 INTERRUPTED_MESSAGE = 'mag-tracking: interrupted'
-"""Message printed after Ctrl-C."""
 
 BROKEN_PIPE_STATUS = 128 + signal.SIGPIPE
 """Exit status if the reader of stdout has closed the pipe, as for other Unix commands."""
@@ -31,11 +30,8 @@ def command() -> NoReturn:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with `argv`, by default `sys.argv[1:]`, and return its exit status.
-
-    It is 0 for success, 1 for an error that has been printed, 130 after Ctrl-C. Some commands
-    return other values, which their help texts describe.
-    """
+    """Run the command with `argv`, by default `sys.argv[1:]`; return its exit status: 0 for
+    success, 1 for an error that has been printed, 130 after Ctrl-C, others as in the help text."""
     arguments = sys.argv[1:] if argv is None else argv
     for argument in arguments:
         # Paths cannot contain NUL, but functions that take a path report this in different ways.
@@ -79,7 +75,6 @@ def _is_stdout_closed() -> bool:
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run a parsed command and return its exit status."""
     try:
         status: int = args.run_command(args)
         # sys.stdout is None if the process was started with a closed stdout.

@@ -8,14 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from mag_tracking.apps.archive import archive, recordings_of, size_of
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_settings,
-    recorded_network,
-    settings_of,
-)
+from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
@@ -46,14 +39,14 @@ how to use one with certificates (tls://...).
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'archive', _archive, _ARCHIVE_HELP)
+    p = options.add_command(commands, 'archive', _archive, _ARCHIVE_HELP)
     p.add_argument('recordings', nargs='+', metavar='FOLDER|GLOB|RECORDING',
                    help='recordings; folders are searched recursively')
-    add_recorded_network(p)
+    options.add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder of the dataset')
-    add_settings(p)
+    options.add_settings(p)
     executor = p.add_mutually_exclusive_group()
     executor.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
                           help='number of processes on this machine (default: one per processor)')
@@ -62,11 +55,10 @@ def add(commands: Commands) -> None:
 
 
 def _archive(args: argparse.Namespace) -> int:
-    """Run `mag-tracking archive`."""
     if args.workers < 1:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
-    network = recorded_network(args)
-    settings = settings_of(args, network)
+    network = options.recorded_network(args)
+    settings = options.settings_of(args, network)
     recordings = recordings_of(args.recordings)
     with recorded_signals(signal.SIGINT) as signals, \
             tqdm(total=sum(map(size_of, recordings)), unit='B', unit_scale=True, desc='archive',

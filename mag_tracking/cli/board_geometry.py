@@ -11,20 +11,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.calibrate import (
-    ASSUMED_NOISE,
-    GeometrySurvey,
-    board_of,
-    survey_geometry,
-)
+from mag_tracking.apps import calibrate
 from mag_tracking.calibration.network_fit import GeometrySettings
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_network,
-    check_writable,
-    utc_timestamp,
-)
+from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
@@ -54,25 +43,25 @@ examples:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the command."""
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
-    p = add_command(commands, 'calibrate board', _geometry,
-                    _GEOMETRY_HELP.replace('{settings}', settings))
+    p = options.add_command(commands, 'calibrate board', _geometry,
+                            _GEOMETRY_HELP.replace('{settings}', settings))
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     geometry = p.add_mutually_exclusive_group(required=True)
     geometry.add_argument('--sensors', type=Path, metavar='FILE',
                           help='nominal positions x,y,z [m] of all sensors (.csv); the axes of '
                           'each sensor are nominally parallel to x, y and z')
-    add_network(geometry, required=False, text='network file with the nominal geometry, sensors '
-                'in the order of the table')
+    options.add_network(geometry, required=False, text='network file with the nominal geometry, '
+                        'sensors in the order of the table')
     p.add_argument('--moment', required=True, type=float, metavar='A_M2',
                    help='magnitude of the magnet\'s moment [A m^2]')
     p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
     p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard deviation '
                    'of one reading, for sensors without noise_std in the network file '
-                   f'(default: {ASSUMED_NOISE:g}, not written to the output)')
+                   f'(default: {calibrate.ASSUMED_NOISE:g}, not written to the output)')
     p.add_argument('--unknown-poses', action='store_true',
                    help='estimate the poses of the magnet, if there is no tracker')
     for name, corner in (('--low', 'lower'), ('--high', 'upper')):
@@ -85,15 +74,14 @@ def add(commands: Commands) -> None:
 
 
 def _geometry(args: argparse.Namespace) -> int:
-    """Run `mag-tracking calibrate board`."""
     box = _checked_box(args)
-    network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
+    network = calibrate.board_of(args.sensors) if args.sensors else read_network(args.network)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
     unknowns = "magnet's poses and the geometry" if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
     with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):
-        survey = survey_geometry(args.table, network, args.moment, settings, utc_timestamp(),
-                                 box, args.noise_std)
+        survey = calibrate.survey_geometry(args.table, network, args.moment, settings,
+                                           options.utc_timestamp(), box, args.noise_std)
     _print(survey, box is not None)
     if not survey.geometry.converged:
         print(f'mag-tracking: calibration rejected: {survey.geometry.reason}; nothing was written',
@@ -115,8 +103,7 @@ def _geometry(args: argparse.Namespace) -> int:
 
 
 def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Return the corners of the box, or None without --unknown-poses; raises SettingsError,
-    OutputError for any invalid option."""
+    """Return the corners of the box, None without --unknown-poses; check all options."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
         raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '
@@ -132,8 +119,7 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
                                    and np.less(*corners).all()):
         raise SettingsError(f'--high: expected values above {args.low} in x, y and z, got '
                             f'{args.high}')
-    for path in (args.out, args.figure):
-        check_writable(path)
+    options.check_outputs(args)
     return corners if args.unknown_poses else None
 
 
@@ -158,8 +144,7 @@ def _elapsed_time(task: str) -> Iterator[None]:
             ticker.join()
 
 
-def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
-    """Print the calibration as a table, followed by its quality and warnings."""
+def _print(survey: calibrate.GeometrySurvey, has_unknown_poses: bool) -> None:
     g = survey.geometry
     if g.converged:
         print('sensor      shift [mm]    rotation [deg] gain            '
@@ -184,7 +169,7 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
               f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
     if n_assumed := sum(std is None for std in survey.network.noise_std):
         print(f'  note: noise of {quantity(n_assumed, "sensor")} assumed to be '
-              f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
+              f'{calibrate.ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
     for j, name in enumerate(survey.network.names):
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
@@ -195,8 +180,7 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
               f'{", ".join(map(str, survey.suspect_rows))}')
 
 
-def _row(survey: GeometrySurvey, j: int) -> str:
-    """Format the row of sensor `j` in the table."""
+def _row(survey: calibrate.GeometrySurvey, j: int) -> str:
     g = survey.geometry
     shift = 1e3 * np.linalg.norm(survey.network.positions[j] - survey.nominal.positions[j])
     shift_std, rotation_std = (np.sqrt(np.square(v[j]).mean())

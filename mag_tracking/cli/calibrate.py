@@ -9,23 +9,9 @@ from typing import NoReturn
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.calibrate import Calibration, calibrate, tumble
+from mag_tracking.apps.calibrate import Calibration, calibrate, sensor_rows, tumble
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_report,
-    add_settings,
-    add_table_options,
-    check_outputs,
-    check_report,
-    print_notes,
-    recorded_network,
-    settings_of,
-    table_options,
-    utc_timestamp,
-)
+from mag_tracking.cli import options
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
@@ -69,13 +55,13 @@ examples:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the commands."""
     p = _add_command(commands, 'calibrate network', _network, _NETWORK_HELP, 'or rosbag2 folder')
-    add_settings(p)
+    options.add_settings(p)
     p.add_argument('--no-passes', action='store_true',
                    help='do not estimate headings from passing targets')
-    add_report(p)
+    options.add_report(p)
     p = _add_command(commands, 'calibrate tumble', _tumble, _TUMBLE_HELP,
                      'rosbag2 folder, or table of readings')
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
@@ -83,16 +69,15 @@ def add(commands: Commands) -> None:
     p.add_argument('--field-magnitude', type=float, metavar='TESLA',
                    help='magnitude of the ambient field (if it is not given, the mean gain is not '
                    'calibrated)')
-    add_table_options(p, sensor=False)
+    options.add_table_options(p, sensor=False)
 
 
-def _add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
+def _add_command(commands: options.Commands, name: str, run: Callable[[argparse.Namespace], int],
                  text: str, kinds: str) -> argparse.ArgumentParser:
-    """Register a command with its recording, network and outputs."""
-    p = add_command(commands, name, run, text)
+    p = options.add_command(commands, name, run, text)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help=f'.mcap, .db3 or .bag file, {kinds}')
-    add_recorded_network(p)
+    options.add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
     p.add_argument('--figure', type=Path, metavar='FILE', help='draw the calibration (.png, .pdf)')
     return p
@@ -104,16 +89,15 @@ def _bar(args: argparse.Namespace, size: int | None) -> 'tqdm[NoReturn]':
 
 
 def _network(args: argparse.Namespace) -> int:
-    """Run `mag-tracking calibrate network`."""
-    network = recorded_network(args)
-    settings = settings_of(args, network)
+    network = options.recorded_network(args)
+    settings = options.settings_of(args, network)
     recording = Recording(args.recording)
-    check_outputs(args)
-    check_report(args, args.recording, args.network, args.out, args.figure)
+    options.check_outputs(args)
+    options.check_report(args, args.recording, args.network, args.out, args.figure)
     n_reads = 1 if args.no_passes else 2
     with recorded_signals(signal.SIGINT) as signals, _bar(args, n_reads * recording.size) as bar:
-        result = calibrate(recording, network, settings, utc_timestamp(), not args.no_passes,
-                           bar.update, lambda: bool(signals))
+        result = calibrate(recording, network, settings, options.utc_timestamp(),
+                           not args.no_passes, bar.update, lambda: bool(signals))
     _print(result, recording)
     if signals:
         print('interrupted: nothing was written')
@@ -136,11 +120,14 @@ def _network(args: argparse.Namespace) -> int:
 
 
 def _print(result: Calibration, recording: Recording) -> None:
-    """Print the calibration as a table, followed by notes and warnings."""
     survey = result.survey
     print('sensor      tilt     heading [deg]    clock [ms]          noise [nT]           source')
-    for j, sensor in enumerate(survey.sensors):
-        print(f'{sensor.sensor:11s} {_row(result, j)}')
+    for name, tilt, heading, std, clock, clock_std, noise, source in sensor_rows(result.network):
+        std_text = '  (?)' if np.isnan(std) else f'({std:.1f})'
+        clock_text = '' if np.isnan(clock_std) else f'{1e3 * clock:+8.2f} ({1e3 * clock_std:.2f})'
+        noise_text = '' if noise is None else ' '.join(f'{1e9 * v:5.1f}' for v in noise)
+        print(f'{name:11s} {tilt:6.1f}  {heading:+8.1f} {std_text:>6s}  {clock_text:16s}  '
+              f'{noise_text:17s}  {source}')
     if survey.reference:
         print(f'clock offsets relative to {survey.reference}')
     if result.evidence is not None:
@@ -159,34 +146,16 @@ def _print(result: Calibration, recording: Recording) -> None:
         print(f'  warning: {cause}: {n}')
 
 
-def _row(result: Calibration, j: int) -> str:
-    """Format the row of sensor `j` in the table."""
-    network = result.network
-    R, std = network.R_ws[j], network.orientation_std[j]
-    tilt = np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
-    # Direction of the sensor's x axis in the horizontal plane.
-    heading = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
-    sd = '  (?)' if std is None else f'({np.degrees(std[2]):.1f})'
-    calibrated, noise = network.calibrated[j], network.noise_std[j]
-    clock = ' ' * 16
-    if calibrated is not None and not np.isnan(calibrated.clock_offset_std):
-        clock = f'{1e3 * network.clock_offset[j]:+8.2f} ({1e3 * calibrated.clock_offset_std:.2f})'
-    noise_column = ' '.join(f'{1e9 * v:5.1f}' for v in noise) if noise is not None else ' ' * 17
-    return (f'{tilt:6.1f}  {heading:+8.1f} {sd:>6s}  {clock:16s}  {noise_column}  '
-            f'{"nominal orientation" if calibrated is None else calibrated.by}')
-
-
 def _tumble(args: argparse.Namespace) -> int:
-    """Run `mag-tracking calibrate tumble`."""
     magnitude = args.field_magnitude
     if magnitude is not None and not 1e-6 <= magnitude <= 1e-3:
         raise SettingsError(f'--field-magnitude: expected 1e-6 to 1e-3 T, got {magnitude:g}')
-    network = recorded_network(args)
+    network = options.recorded_network(args)
     source = _source(args, network)
-    check_outputs(args)
+    options.check_outputs(args)
     size = source.recording.size if isinstance(source, RecordingSource) else None
     with recorded_signals(signal.SIGINT) as signals, _bar(args, size) as bar:
-        calibrated, fits, readings = tumble(source, network, args.sensor, utc_timestamp(),
+        calibrated, fits, readings = tumble(source, network, args.sensor, options.utc_timestamp(),
                                             magnitude, bar.update, lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)
@@ -209,16 +178,15 @@ def _tumble(args: argparse.Namespace) -> int:
 
 
 def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource | ArraySource:
-    """Open the recording, or read the table of readings."""
     from mag_tracking.recording.field_table import SUFFIXES, read_field_table
 
     if args.recording.suffix.lower() not in SUFFIXES:
         return RecordingSource(Recording(args.recording), network)
     # The name of the only sensor of a table that does not name it.
     candidates = args.sensor or network.names
-    table = read_field_table(args.recording, table_options(
+    table = read_field_table(args.recording, options.table_options(
         args, candidates[0] if len(candidates) == 1 else ''), with_times=False)
-    print_notes(args.recording, table.notes)
+    options.print_notes(args.recording, table.notes)
     readings = Readings.joined(table.sessions)
     if not set(readings.names) & set(network.names):
         raise RecordingError(f'the table has the sensors {", ".join(readings.names)}, and the '
@@ -227,7 +195,6 @@ def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource
 
 
 def _print_fit(name: str, fit: EllipsoidFit) -> None:
-    """Print the ellipsoid fit of one sensor, or the reason for its rejection."""
     if not fit.converged:
         print(f'{name}: calibration rejected: {fit.reason}')
     else:

@@ -9,13 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.signature_classifier import train
-from mag_tracking.apps.classes import (
-    Examples,
-    check_axes,
-    evaluate_classes,
-    examples_of,
-    labelled_signatures,
-)
+from mag_tracking.apps import classes
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network, check_writable
 from mag_tracking.errors import OutputError, SettingsError
@@ -67,18 +61,17 @@ def add(commands: Commands) -> None:
                            help='number of 70/30 splits, if --model is not given (default: 20)')
 
 
-def _examples(args: argparse.Namespace) -> Examples:
+def _examples(args: argparse.Namespace) -> classes.Examples:
     """Read the signatures given by the options; print a warning for each unusable signature."""
     network = None if args.network is None else read_network(args.network)
-    examples = examples_of(labelled_signatures(args.labelled, args.labels, network,
-                                               args.action != 'predict'))
+    examples = classes.examples_of(classes.labelled_signatures(args.labelled, args.labels, network,
+                                                               args.action != 'predict'))
     for reason in examples.unusable:
         print(f'  warning: not used: {reason}')
     return examples
 
 
 def _train(args: argparse.Namespace) -> int:
-    """Run `mag-tracking classes train`."""
     check_writable(args.out)
     if any(path is not None and path.resolve() == args.out.resolve()
            for path in (args.labelled, args.labels, args.network)):
@@ -92,13 +85,12 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    """Run `mag-tracking classes evaluate`."""
     if args.splits < 1:
         raise SettingsError(f'--splits: expected 1 or more, got {args.splits}')
     examples = _examples(args)
     model = None if args.model is None else read_model(args.model)
-    evaluation = evaluate_classes(examples, model, args.splits,
-                                  partial(tqdm, desc='splits', disable=None, leave=False))
+    evaluation = classes.evaluate_classes(examples, model, args.splits,
+                                          partial(tqdm, desc='splits', disable=None, leave=False))
     test_method = f'{quantity(args.splits, "split")} of 70/30' if model is None else f'{args.model}'
     print(f'{quantity(len(examples.labels), "signature")}, {test_method}; {evaluation.n} tested')
     print(f'  largest class: {evaluation.majority:.1%} (accuracy of a constant prediction)')
@@ -123,9 +115,8 @@ def _mean_fraction(values: FloatArray) -> str:
 
 
 def _predict(args: argparse.Namespace) -> int:
-    """Run `mag-tracking classes predict`."""
     model, examples = read_model(args.model), _examples(args)
-    check_axes(examples, model)
+    classes.check_axes(examples, model)
     names, posterior = model.names(examples.x), model.posterior(examples.x)
     for source, name, p in zip(examples.sources, names, posterior, strict=True):
         print(f'{source}: {name} ('

@@ -10,7 +10,6 @@ from typing import NamedTuple, NoReturn
 PACKAGE = 'mag_tracking'
 ROS_ARGUMENTS = '--ros-args'
 ROS_COMMANDS = ('run', 'record', 'doctor', 'ros')
-"""Commands that accept ROS arguments."""
 
 
 class Command(NamedTuple):
@@ -19,7 +18,6 @@ class Command(NamedTuple):
     module: str
     """Module in this folder. The function `add` of the module registers all its commands."""
     summary: str
-    """Summary in the list of commands."""
 
 
 COMMANDS = {
@@ -54,7 +52,6 @@ PARENTS = {
     'calibrate': 'Calibrate a network, hand-held sensors or a board.',
     'ros': 'Inspect and control running nodes (needs ROS 2).',
 }
-"""Summaries of the commands with subcommands."""
 GROUPS = {
     'process recordings': ('replay', 'fit', 'archive', 'classes'),
     'set up sensors': ('plan', 'listen', 'calibrate', 'doctor'),
@@ -73,10 +70,7 @@ RENAMED = {
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse a command line without the program name.
-
-    `run_command` of the namespace takes the namespace and returns the exit status.
-    """
+    """Parse a command line without the program name; `run_command` returns the exit status."""
     parser = argparse.ArgumentParser(
         prog='mag-tracking', usage='%(prog)s [--help] [--version] COMMAND ...',
         description='Track magnetic targets with stationary magnetometers.', epilog=_overview(),
@@ -106,7 +100,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _overview() -> str:
-    """Format the commands by purpose."""
     lines = []
     for group, names in GROUPS.items():
         lines += [f'{group}:', *(f'  {name:11}{PARENTS.get(name) or COMMANDS[name].summary}'

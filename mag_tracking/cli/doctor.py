@@ -6,18 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mag_tracking.apps.doctor import Doctor, examine
-from mag_tracking.apps.doctor_report import write_report
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_report,
-    add_settings,
-    check_report,
-    recorded_network,
-    settings_of,
-)
+from mag_tracking.apps.doctor import Doctor, examine, write_report
+from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
@@ -37,25 +27,24 @@ examples:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'doctor', _doctor, _DOCTOR_HELP)
+    p = options.add_command(commands, 'doctor', _doctor, _DOCTOR_HELP)
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',
                    help='examine live topics for SECONDS instead of a recording (needs ROS 2)')
-    add_recorded_network(p)
-    add_settings(p)
-    add_report(p)
+    options.add_recorded_network(p)
+    options.add_settings(p)
+    options.add_report(p)
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    """Run `mag-tracking doctor`."""
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: give either RECORDING or --live SECONDS')
-    network = recorded_network(args)
-    settings = settings_of(args, network)
-    check_report(args, args.recording, args.network)
+    network = options.recorded_network(args)
+    settings = options.settings_of(args, network)
+    options.check_report(args, args.recording, args.network)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:
@@ -98,7 +87,6 @@ def _report(args: argparse.Namespace, doctor: Doctor, further_findings: list[Fin
 
 
 def _row(health: SensorHealth) -> str:
-    """Format the row of a sensor in the table."""
     c = health.counts
     if not c['readings']:
         return 'no readings'

@@ -13,18 +13,9 @@ from tqdm import tqdm
 from mag_tracking.analysis.correlated_motion import contradicts_delays
 from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
-from mag_tracking.apps.fit import check_cpa_range, check_orders
-from mag_tracking.apps.passes import PassFitter
+from mag_tracking.apps.fit import PassFitter, check_cpa_range, check_orders
 from mag_tracking.arrays import FloatArray
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_recorded_network,
-    add_verbose,
-    distinct_names,
-    print_diagnoses,
-    recorded_network,
-)
+from mag_tracking.cli import options
 from mag_tracking.cli.tables import HEADER, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
@@ -36,6 +27,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.results.fit_folder import FitFolder
+from mag_tracking.results.result_folder import REPORT
 from mag_tracking.run import RecordingSource, RunReport, progress_bar, run
 from mag_tracking.settings import read_parameter_file
 from mag_tracking.units import NS
@@ -74,12 +66,12 @@ examples:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'fit', _fit, _FIT_HELP)
+    p = options.add_command(commands, 'fit', _fit, _FIT_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_recorded_network(p)
+    options.add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--orders', nargs='+', type=int, default=ORDERS, metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
@@ -92,7 +84,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--params', type=Path, metavar='FILE',
                    help='YAML file with the settings to override')
     p.add_argument('--no-figures', action='store_true', help='do not draw figures')
-    add_verbose(p)
+    options.add_verbose(p)
 
 
 class Fits:
@@ -136,10 +128,9 @@ class Fits:
 
 
 def _fit(args: argparse.Namespace) -> int:
-    """Run `mag-tracking fit`."""
-    network = recorded_network(args)
+    network = options.recorded_network(args)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
-    distinct_names(args.recordings)
+    options.distinct_names(args.recordings)
     check_orders('--orders', args.orders)
     check_cpa_range('--cpa-range', args.cpa_range, network)
     earth = network.earth_field
@@ -161,7 +152,7 @@ def _fit(args: argparse.Namespace) -> int:
             with progress_bar(source) as bar:
                 report = run(source, pipeline, [fits.sink(source.stem, pipeline)], bar.update,
                              stopped)
-            print_diagnoses(report.diagnoses)
+            options.print_diagnoses(report.diagnoses)
             warnings += [f'{source.name}: {line}' for line in report.warnings()]
             if signals:
                 break
@@ -175,12 +166,11 @@ def _fit(args: argparse.Namespace) -> int:
 
 def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                   args: argparse.Namespace) -> None:
-    """Write the report of all passes, and draw their cost over the number of dipoles."""
     # Imported here, as in `_draw`, because it loads matplotlib.
-    from mag_tracking.apps.fit_report import order_figure, write_report
+    from mag_tracking.apps.fit_report import fit_page, order_figure
     from mag_tracking.report.style import save_figure
 
-    write_report(passes, network, warnings, args.out)
+    fit_page(passes, network, warnings).write(args.out / REPORT)
     if not passes:
         print('no passes: nothing was detected')
     elif not args.no_figures:
@@ -188,7 +178,6 @@ def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings
 
 
 def _row(fitted_pass: FittedPass) -> str:
-    """Format the row of a fitted pass, with the quantities that are trusted."""
     label = f'pass {fitted_pass.number}' + f'.{fitted_pass.vehicle}' * (fitted_pass.n_vehicles > 1)
     fit = fitted_pass.reported
     if fit is None:
@@ -212,7 +201,6 @@ def _closest_approach(fit: PassFit) -> tuple[float, float, float, float]:
 
 
 def _print_details(fitted_pass: FittedPass) -> None:
-    """Print the fits of one pass as a table, one row per number of dipoles."""
     data = fitted_pass.fits[0].data
     print(f'{fitted_pass.recording}, {fitted_pass.label}: '
           f'{quantity(data.n_values, "measurement")}, '
@@ -247,7 +235,6 @@ def _print_details(fitted_pass: FittedPass) -> None:
 
 
 def _print_chosen(fitted_pass: FittedPass, chosen: PassFit) -> None:
-    """Print the quality and the closest approach of the chosen fit of a pass."""
     if chosen.normalised_cost > MAX_NORMALISED_COST:
         print(f'  poor fit (cost {chosen.normalised_cost:.1f}): errors of speed and position may '
               'be several standard deviations')
@@ -261,7 +248,6 @@ def _print_chosen(fitted_pass: FittedPass, chosen: PassFit) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format speed, direction and time of a rejected fit, as far as they are reliable."""
     time, time_std, _, _ = _closest_approach(fit)
     values = {'speed': f'{_with_std(fit.speed, 2)} m/s',
               'direction': f'{_with_std(np.degrees(fit.heading), 1)} deg',
@@ -271,7 +257,6 @@ def _trusted_values(fit: PassFit) -> str:
 
 
 def _formatted_estimates(fit: PassFit) -> str:
-    """Format the estimates of a fit, with standard deviations in parentheses."""
     sd = np.sqrt(np.diagonal(fit.position_covariance))
     position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
@@ -282,7 +267,6 @@ def _formatted_estimates(fit: PassFit) -> str:
 
 
 def _with_std(estimate: Iterable[float], digits: int) -> str:
-    """Format a value and its standard deviation."""
     value, std = estimate
     return f'{value:.{digits}f}({std:.{digits}f})'
 
@@ -330,10 +314,7 @@ def _iron(passes: Sequence[FittedPass], earth_field: FloatArray) -> dict[str, An
 
 
 def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
-    """Find reasons not to use an estimate of hard and soft iron from the moments of `n_passes`.
-
-    `soft_std` [m³] is the std of the soft iron, inflated if the normalised cost exceeds 1.
-    """
+    """Find reasons not to use an estimate of hard and soft iron, with its inflated std [m³]."""
     degrees_of_freedom = 3 * n_passes - 4
     if iron.normalised_cost * degrees_of_freedom > energy_threshold(P_WARNING, degrees_of_freedom):
         yield ('the moments contradict each other; the passes may be of different vehicles, or one '
@@ -343,7 +324,6 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, fit: PassFit, out: Path) -> None:
-    """Draw the fit of a pass."""
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import pass_figure
     from mag_tracking.report.style import save_figure

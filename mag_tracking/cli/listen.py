@@ -66,7 +66,6 @@ class _ReadingPrinter:
         self._thread.start()
 
     def _add(self, readings: Readings, accelerations: Iterable[AccelerationSample]) -> None:
-        """Store received fields and accelerations by sensor."""
         for name, stamp, field in zip(readings.sensor_names(), readings.stamp_ns.tolist(),
                                       readings.field, strict=True):
             self._samples[name].append((stamp, field))
@@ -122,7 +121,6 @@ def _sample_line(samples: Sequence[Sample], elapsed_s: float) -> str:
 
 
 def _listen(args: argparse.Namespace) -> int:
-    """Run `mag-tracking listen`."""
     if not args.seconds > 0.0:
         raise SettingsError(f'--seconds: expected a number above 0, got {args.seconds:g}')
     network = read_network(args.network) if args.network else None

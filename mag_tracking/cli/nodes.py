@@ -10,14 +10,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from mag_tracking.apps.record import Selection
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_network,
-    add_page,
-    add_settings,
-    settings_of,
-)
+from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.network.sensor_network import TOPIC_NAME_PATTERN
@@ -55,11 +48,11 @@ examples:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the commands."""
-    p = add_command(commands, 'run', _run, _RUN_HELP)
-    add_network(p)
-    add_settings(p)
+    p = options.add_command(commands, 'run', _run, _RUN_HELP)
+    options.add_network(p)
+    options.add_settings(p)
     p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this recording')
     p.add_argument('--drivers', type=Path, metavar='DRIVERS',
                    help='run a driver node with the devices of this drivers file')
@@ -74,9 +67,9 @@ def add(commands: Commands) -> None:
     p.add_argument('--quiet', action='store_true', help='do not print the poses of tracks')
     p.add_argument('--web', type=int, nargs='?', const=DEFAULT_PORT, metavar='PORT',
                    help=f'serve a live page (default port: {DEFAULT_PORT})')
-    add_page(p, port=False)
-    p = add_command(commands, 'record', _record, _RECORD_HELP)
-    add_network(p)
+    options.add_page(p, port=False)
+    p = options.add_command(commands, 'record', _record, _RECORD_HELP)
+    options.add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
                    help='output folder')
     p.add_argument('--topics', nargs='+', default=[], metavar='TOPIC',
@@ -92,11 +85,10 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run `mag-tracking run`."""
     # Imported here because it needs ROS.
     from mag_tracking.nodes.runner import run
 
-    settings = settings_of(args, read_network(args.network))
+    settings = options.settings_of(args, read_network(args.network))
     ros_arguments = list(args.ros_arguments)
     if args.web is None and args.host != LOOPBACK:
         raise SettingsError('--host sets the address of the live page; add --web')
@@ -112,10 +104,7 @@ def _run(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
-    """Run the live page in a separate process, so that it cannot delay the nodes.
-
-    The first of the ROS arguments is `--ros-args`. Raises DeviceError if the port cannot be opened.
-    """
+    """Run the live page in a process that cannot delay the nodes; raises DeviceError."""
     check_port(host, port)
     # The page process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([
@@ -142,7 +131,6 @@ def _page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterato
 
 
 def _record(args: argparse.Namespace) -> int:
-    """Run `mag-tracking record`."""
     for option, value, minimum in (('--split-mb', args.split_mb, 0.1),
                                    ('--split-s', args.split_s, 1.0)):
         if not (math.isfinite(value) and value >= minimum):

@@ -24,15 +24,10 @@ if TYPE_CHECKING:
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 """Subparsers of the main parser or of a command, to which each command is added."""
 
-FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
-
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
-    """Add the parser of a command or subcommand; `name` is a key in `COMMANDS`.
-
-    `run` returns the exit status. `text`, with examples, is printed after the options.
-    """
+    """Add the parser of the command `name` in `COMMANDS`; `text` is printed after its options."""
     summary = COMMANDS[name].summary
     parser = commands.add_parser(
         name.rpartition(' ')[2], help=summary, description=summary, epilog=text,
@@ -64,8 +59,7 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Names without extension under which the results of the recordings are stored; raises
-    OutputError if two are equal."""
+    """Names of results without extension; raises OutputError if two recordings share one."""
     names = [path.resolve().stem for path in paths]
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
@@ -113,8 +107,7 @@ def check_writable(path: Path | None) -> None:
 
 
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
-    """Raise OutputError if the report cannot be written, does not end in .html or .htm, or would
-    replace one of `others`."""
+    """Raise OutputError if --report cannot be written, is not HTML, or would replace `others`."""
     path = args.report
     if path is None:
         return
@@ -127,13 +120,17 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Raise OutputError if the files of --out and --figure cannot be written, and SettingsError if
-    the file type of the figure is not supported."""
+    """Raise OutputError if --out or --figure cannot be written, SettingsError for the file type."""
     for path in (args.out, args.figure):
         check_writable(path)
-    if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
-        raise SettingsError(f'--figure: expected a file name ending in '
-                            f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
+    if args.figure is not None:
+        # Imported here because it loads matplotlib.
+        from matplotlib.backend_bases import FigureCanvasBase
+
+        types = FigureCanvasBase.get_supported_filetypes()
+        if args.figure.suffix.lower().removeprefix('.') not in types:
+            raise SettingsError(f'--figure: expected a file name ending in .{", .".join(types)}; '
+                                f'got {args.figure.name}')
 
 
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
@@ -154,10 +151,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def settings_of(args: argparse.Namespace, network: SensorNetwork) -> 'Settings':
-    """Settings of --target and --params; raises SettingsError if the parameter file is invalid.
-
-    Without both, a board of sensors selects a magnet, and a line is printed.
-    """
+    """Settings of --target and --params, by default for a magnet if the sensors form a board."""
     from mag_tracking.pipeline import settings_for
 
     changes = read_parameter_file(args.params) if args.params else {}
@@ -205,8 +199,7 @@ def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> N
 
 
 def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'TableOptions':
-    """Collect the options of `add_table_options`, with the name `sensor` of the only sensor if
-    --sensor is not one of them; raises SettingsError if --sensors is not valid."""
+    """Collect the options of `add_table_options`, with the name `sensor` if not an option."""
     from mag_tracking.recording.field_table import TableOptions
 
     sensors = dict(text.rpartition('=')[::2] for text in args.sensors)

@@ -73,7 +73,6 @@ def add(commands: Commands) -> None:
 
 
 def _plan(args: argparse.Namespace) -> int:
-    """Run `mag-tracking plan`."""
     network = read_network(args.network)
     kind = 'magnet' if args.target == 'magnet' else 'vehicle'
     settings = settings_for(kind, read_parameter_file(args.params) if args.params else {})
@@ -101,7 +100,6 @@ def _plan(args: argparse.Namespace) -> int:
 
 
 def _write(p: Plan, out: Path) -> None:
-    """Write the figures and `plan.json`."""
     def values(source: object, names: str) -> dict[str, Any]:
         attributes = ((name, getattr(source, name)) for name in names.split())
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes}

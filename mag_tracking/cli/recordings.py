@@ -8,14 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from mag_tracking.apps.info import Source, Timing, time_topics
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_network,
-    add_table_options,
-    print_notes,
-    table_options,
-)
+from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network import SensorNetwork
@@ -63,28 +56,27 @@ example:
 '''
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the commands."""
-    p = add_command(commands, 'info', _info)
+    p = options.add_command(commands, 'info', _info)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_network(p, False, 'network file; report which of its topics are recorded')
-    p = add_command(commands, 'import', _import, _IMPORT_HELP)
+    options.add_network(p, False, 'network file; report which of its topics are recorded')
+    p = options.add_command(commands, 'import', _import, _IMPORT_HELP)
     p.add_argument('table', type=Path, metavar='TABLE', help='table of readings or poses')
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
-    add_table_options(p)
+    options.add_table_options(p)
     poses = p.add_argument_group('table of magnet poses')
     poses.add_argument('--background', type=Path, metavar='FILE.csv',
                        help='table with the background of each sensor')
     poses.add_argument('--noise-std', type=float, default=1e-6, metavar='TESLA',
                        help='noise standard deviation of one reading (default: 1e-6)')
-    p = add_command(commands, 'repair', _repair, _REPAIR_HELP)
+    p = options.add_command(commands, 'repair', _repair, _REPAIR_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap file or rosbag2 folder')
 
 
 def _info(args: argparse.Namespace) -> int:
-    """Run `mag-tracking info`."""
     recording = Recording(args.recording)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
               disable=None) as bar:
@@ -123,7 +115,6 @@ def _print_duration(recording: Recording, timings: Sequence[Timing]) -> None:
 
 def _print_sensors(network: SensorNetwork, recording: Recording,
                    timings: Mapping[Source, Timing]) -> None:
-    """Print which sensors of the network are recorded."""
     namespaces = namespaces_of(network.topics, recording.types) or ['/']
     if len(namespaces) > 1:
         print(f'  namespaces with topics of the network: {", ".join(namespaces)}')
@@ -139,7 +130,6 @@ def _print_sensors(network: SensorNetwork, recording: Recording,
 
 
 def _import(args: argparse.Namespace) -> int:
-    """Run `mag-tracking import`."""
     # Imported here because other commands do not need them.
     from mag_tracking.recording.field_table import describe, import_field_table
     from mag_tracking.recording.pose_table import import_pose_table
@@ -152,8 +142,8 @@ def _import(args: argparse.Namespace) -> int:
                                                   args.noise_std)
         print(f'{quantity(n, "reading")} written to {recording}, network to {network}')
         return 0
-    recordings, content = import_field_table(args.table, table_options(args), args.out)
-    print_notes(args.table, content.notes)
+    recordings, content = import_field_table(args.table, options.table_options(args), args.out)
+    options.print_notes(args.table, content.notes)
     for recording, readings in zip(recordings, content.sessions, strict=True):
         first, last = (int(t) for t in readings.stamp_ns[[0, -1]])
         print(f'{quantity(len(readings), "reading")} written to {recording}: '
@@ -171,7 +161,6 @@ def _time_text(stamp_ns: int) -> str:
 
 
 def _repair(args: argparse.Namespace) -> int:
-    """Run `mag-tracking repair`."""
     n = repair(args.recording)
     print(f'{args.recording}: files repaired: {n}')
     return 0

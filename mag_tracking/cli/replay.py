@@ -17,19 +17,8 @@ from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.apps.replay import Run, replay, write_figures, write_trajectories
 from mag_tracking.apps.replay_report import notes_of, write_report
 from mag_tracking.apps.traffic import check_vehicles
+from mag_tracking.cli import options
 from mag_tracking.cli.fit import ORDERS, Fits
-from mag_tracking.cli.options import (
-    Commands,
-    add_command,
-    add_page,
-    add_recorded_network,
-    add_settings,
-    add_verbose,
-    distinct_names,
-    print_diagnoses,
-    recorded_network,
-    settings_of,
-)
 from mag_tracking.cli.tables import HEADER, Events, Passages, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
@@ -110,18 +99,18 @@ TRUTH_METRICS = {
 """Description and unit of each error measure, by its key in a track's `truth` in summary.json."""
 
 
-def add(commands: Commands) -> None:
+def add(commands: options.Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'replay', _replay, _REPLAY_HELP)
+    p = options.add_command(commands, 'replay', _replay, _REPLAY_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_recorded_network(p)
+    options.add_recorded_network(p)
     p.add_argument('--out', type=Path, metavar='DIR', help='output folder; passages and events '
                    'are only printed without it')
-    add_settings(p)
+    options.add_settings(p)
     p.add_argument('--tables', type=_tables, default=[POSES], metavar='NAME,NAME,...',
                    help=f'tables to compute: {", ".join((POSES, *TABLES))} (default: {POSES})')
-    add_verbose(p)
+    options.add_verbose(p)
     poses = p.add_argument_group('table poses')
     poses.add_argument('--truth', metavar='TOPIC|FILE.csv', help='ground truth: a topic '
                        'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a CSV table '
@@ -142,12 +131,11 @@ def add(commands: Commands) -> None:
     live.add_argument('--live', action='store_true', help='track the recording in real time on a '
                       'live page instead of writing files; Ctrl-C ends the command')
     live.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
-    add_page(live)
+    options.add_page(live)
     p.set_defaults(orders=ORDERS, cpa_range=None)
 
 
 def _tables(text: str) -> list[str]:
-    """Parse --tables."""
     names = list(dict.fromkeys(text.split(',')))
     if not {*names} <= {POSES, *TABLES}:
         raise argparse.ArgumentTypeError(f'expected names from {", ".join((POSES, *TABLES))}, '
@@ -156,13 +144,12 @@ def _tables(text: str) -> list[str]:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    """Run `mag-tracking replay`."""
-    network = recorded_network(args)
-    settings = settings_of(args, network)
+    network = options.recorded_network(args)
+    settings = options.settings_of(args, network)
     _check(args, settings)
     if args.live:
         return _show(args, network, settings)
-    names = distinct_names(args.recordings)
+    names = options.distinct_names(args.recordings)
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
     folders = [args.out / name if args.out and len(names) > 1 else args.out for name in names]
     _check_folders(args, sources, folders)
@@ -210,7 +197,6 @@ def _show(args: argparse.Namespace, network: SensorNetwork, settings: Settings) 
 
 
 def _check(args: argparse.Namespace, settings: Settings) -> None:
-    """Check the combination of the options; raises SettingsError if it is invalid."""
     if args.live:
         if len(args.recordings) > 1 or args.tables != [POSES] or args.tum or args.rerun or any(
                 v is not None for v in (args.out, args.truth, args.fleet, args.enrol)):
@@ -247,10 +233,7 @@ def _check_folders(args: argparse.Namespace, sources: Iterable[RecordingSource],
 def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Settings,
                 out: Path | None, tables: Sequence[Table], stopped: Callable[[], bool],
                 args: argparse.Namespace) -> bool:
-    """Compute the tables of one recording; an interrupted run leaves partial results.
-
-    The result is whether everything could be written.
-    """
+    """Compute the tables of one recording; return whether everything could be written."""
     sinks: list[Sink] = []
 
     def sinks_of(pipeline: Pipeline) -> list[Sink]:
@@ -270,7 +253,7 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
                             max((table.upto for table in tables), key=STAGES.index))
         with progress_bar(source) as bar:
             report = run(source, pipeline, sinks_of(pipeline), bar.update, stopped)
-        print_diagnoses(report.diagnoses)
+        options.print_diagnoses(report.diagnoses)
     errors = [failure.error for failure in report.failures]
     for table, sink in zip(tables, sinks, strict=True):
         if report.has_failed(sink):
@@ -286,7 +269,6 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
 
 def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
            args: argparse.Namespace) -> None:
-    """Write the optional files of the tracks, the report and the figures."""
     if args.tum:
         write_trajectories(result, out)
     if args.rerun:
@@ -297,7 +279,6 @@ def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[],
 
 
 def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool) -> None:
-    """Print counts and notes of a run, and a row and the warnings of each track."""
     counts, tracks = result.summary['counts'], result.summary['tracks']
     verdicts = Counter(t['verdict'] for t in tracks)
     print(f'{name}: {quantity(counts["align"].get("frames", 0), "frame")}, '
@@ -316,8 +297,7 @@ def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool
 
 
 def _row(t: dict[str, Any], log: TrackLog, network: SensorNetwork) -> str:
-    """Format the row of a track: time and distance at its closest pose, speed at the most certain
-    one."""
+    """Format a track: time and distance at its closest pose, speed at the most certain one."""
     distances = np.linalg.norm(np.array(log.position) - network.centre, axis=1)
     closest, best = int(np.argmin(distances)), log.most_certain()
     return vehicle_row(
@@ -327,7 +307,6 @@ def _row(t: dict[str, Any], log: TrackLog, network: SensorNetwork) -> str:
 
 
 def _print_details(t: dict[str, Any], has_truth: bool) -> None:
-    """Print a track: overview, doubts, velocity from delays between sensors, errors."""
     print(f'    {quantity(t["poses"], "pose")}'
           + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
              if t['arrival'] else '')
@@ -351,7 +330,6 @@ def _print_details(t: dict[str, Any], has_truth: bool) -> None:
 
 
 def _print_warnings(t: dict[str, Any]) -> None:
-    """Print the warnings of a track."""
     if t.get('delay', {}).get('contradicts'):
         print('    warning: the velocities of the track and from the delay contradict each other; '
               'rely on neither. Check clock offsets, positions in the network file, the frame '

@@ -51,7 +51,6 @@ def add(commands: Commands) -> None:
 
 
 def _topics(args: argparse.Namespace) -> int:
-    """Run `mag-tracking ros topics`."""
     from mag_tracking.nodes.graph_tools import observer, topics
 
     with observer(args.ros_arguments) as graph:
@@ -62,7 +61,6 @@ def _topics(args: argparse.Namespace) -> int:
 
 
 def _echo(args: argparse.Namespace) -> int:
-    """Run `mag-tracking ros echo`."""
     from mag_tracking.nodes.graph_tools import as_text, observer, receive_messages
 
     if args.count is not None and args.count < 1:
@@ -87,7 +85,6 @@ def _echo(args: argparse.Namespace) -> int:
 
 
 def _param(args: argparse.Namespace) -> int:
-    """Run `mag-tracking ros param`."""
     from mag_tracking.nodes.graph_tools import observer, parameter_lines, set_parameter
 
     with observer(args.ros_arguments) as graph:
@@ -99,7 +96,6 @@ def _param(args: argparse.Namespace) -> int:
 
 
 def _lifecycle(args: argparse.Namespace) -> int:
-    """Run `mag-tracking ros lifecycle`."""
     from mag_tracking.nodes.graph_tools import change_lifecycle_state, lifecycle_state, observer
 
     with observer(args.ros_arguments) as graph:
@@ -111,7 +107,6 @@ def _lifecycle(args: argparse.Namespace) -> int:
 
 
 def _watch(args: argparse.Namespace) -> int:
-    """Run `mag-tracking ros watch`."""
     # Imported here because it needs ROS.
     from mag_tracking.nodes import page_node
 

@@ -20,6 +20,7 @@ from mag_tracking.files import is_utf8_encodable, read_yaml, replace_text, short
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.sensor_network import TOPIC_NAME_PATTERN
+from mag_tracking.settings import yaml_value
 
 _SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
 _KEYS_OF_0_1_0 = {'stated': 'nominal', 'stated_std_deg': 'nominal_std_deg'}
@@ -276,16 +277,10 @@ def earth_field(latitude: float, longitude: float, height: float, year: float,
                      north * np.sin(azimuth) - east * np.cos(azimuth), -down])
 
 
-def _yaml_float(value: float) -> str:
-    """Format a float with a decimal point, which YAML 1.1 requires before an exponent."""
-    text = repr(float(value))
-    return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
-
-
 def _number_lines(indent: str, values: dict[str, Any]) -> list[str]:
     """Format the numbers and arrays that are not None as lines of YAML."""
-    return [f'{indent}{key}: ' + (f'[{", ".join(map(_yaml_float, np.ravel(value)))}]'
-                                  if np.ndim(value) else _yaml_float(value))
+    return [f'{indent}{key}: ' + yaml_value(tuple(map(float, np.ravel(value))) if np.ndim(value)
+                                            else float(value))
             for key, value in values.items() if value is not None]
 
 

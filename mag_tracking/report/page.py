@@ -22,9 +22,7 @@ from mag_tracking.report.style import series_colour
 SCRIPTS = ('scene', 'map', 'body', 'overview', 'curves', 'tables', 'live', 'main', 'start')
 """Script files, in loading order."""
 ERROR, WARNING, NOTE = 'error', 'warning', 'note'
-"""Severities of a note."""
 DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
-"""Dash styles, one for each colour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,6 @@ class Chart:
 
     title: str
     traces: Sequence[Mapping[str, Any]]
-    """Plotly traces."""
     layout: Mapping[str, Any]
 
 
@@ -83,10 +80,8 @@ def live_html() -> str:
 
 
 def _html(title: str, data: Mapping[str, Any]) -> str:
-    """Fill title, style, scripts and data into the template.
-
-    In the data, `<` is escaped so that no string can close the script element.
-    """
+    """Fill the template; in the data, `<` is escaped so that no string can close the script
+    element."""
     def read(name: str) -> str:
         return (resources.files('mag_tracking.report') / name).read_text(encoding='utf-8')
 
@@ -108,10 +103,7 @@ def numbers(values: ArrayLike) -> list[Any]:
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
-    """Plotly trace of a curve; `k` is the index of its colour and dash style.
-
-    An empty `name` omits the legend entry.
-    """
+    """Plotly trace with the `k`-th colour and dash style; without name, without legend."""
     colour = series_colour(k)
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
             'name': escape(name, quote=False), 'showlegend': bool(name),
@@ -121,11 +113,8 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
 
 def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
              low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    """Plotly trace of a heat map `z` (n_y, n_x), with `title` beside the colour bar.
-
-    `scale` is a Plotly colour scale, preferably a perceptually uniform one; `low` and `high` are
-    its limits, by default those of `z`.
-    """
+    """Plotly trace of a heat map `z` (n_y, n_x) with a colour `scale` from `low` to `high`, by
+    default those of `z`, and with `title` beside the colour bar."""
     return {'type': 'heatmap', 'x': numbers(x), 'y': numbers(y), 'z': numbers(z),
             'colorscale': scale, 'zmin': low, 'zmax': high, 'hoverongaps': False,
             # The padding contains the buttons, as the right margin of `map.js`.

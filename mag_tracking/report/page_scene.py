@@ -52,20 +52,14 @@ Packed: TypeAlias = dict[str, str]
 
 
 def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
-    """Encode an array (n,) as JSON object in a third of the space of decimal numbers.
-
-    `kind` is 'f8', 'u1', or 'f4', which is sufficient for values that are only plotted.
-    """
+    """Encode an array (n,) as JSON object; 'f4' is sufficient for values that are only plotted."""
     raw = np.ascontiguousarray(values, dtype=f'<{kind}').tobytes()
     return {kind: base64.b64encode(raw).decode('ascii')}
 
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]], road: Road = NO_ROAD) -> dict[str, Any]:
-    """JSON object of the map with a time slider, of tracks from `track_entry`.
-
-    The page shows seconds since `begin_ns`.
-    """
+    """JSON object of the map of tracks from `track_entry`; times are in s since `begin_ns`."""
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
@@ -86,8 +80,7 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None) -> IntArray:
-    """Indices, ascending, of up to `MAX_SENSORS` sensors with the strongest fields at the poses
-    `rows`, by default all."""
+    """Indices of up to `MAX_SENSORS` sensors with the strongest fields at poses (default: all)."""
     chosen = log.measured if rows is None else [log.measured[k] for k in rows]
     measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
     strength = np.nan_to_num(measured).max(axis=(0, 2), initial=0.0)
@@ -95,8 +88,7 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None) -> IntAr
 
 
 def max_poses_of(logs: Sequence[TrackLog]) -> int:
-    """Maximum number of poses per track that keeps a report below `MAX_BYTES`; at least
-    `MIN_POSES`."""
+    """Maximum number of poses per track that keeps a report below `MAX_BYTES`."""
     lengths = np.array([len(log.stamp_ns) for log in logs])
     sizes = np.array([_pose_size(log) for log in logs])
 
@@ -126,10 +118,7 @@ def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
 
 def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
                 rows: Sequence[int] | None = None) -> dict[str, Any]:
-    """JSON object of a track, with the poses `rows` (all by default) and the fields of `sensors`.
-
-    `begin_ns` is the start of the scene.
-    """
+    """JSON object of poses `rows` of a track, with fields of `sensors`; times since `begin_ns`."""
     rows = range(len(log.stamp_ns)) if rows is None else rows
 
     def column(name: str, *shape: int) -> FloatArray:
@@ -182,10 +171,8 @@ def pose_entry(track_id: int, times: FloatArray, state: FloatArray, C: FloatArra
 
 def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
                 times: FloatArray | None = None) -> dict[str, Any]:
-    """JSON object of the measured and the predicted field (n, 3) [T] of a sensor.
-
-    `times` (n,) [s] are since the start of the scene; None for the times of the poses.
-    """
+    """JSON object of the measured and predicted field (n, 3) [T] of a sensor, at `times` (n,) [s]
+    since the start of the scene, or None for those of the poses."""
     return {'sensor': sensor, 't': None if times is None else packed(times), **{
         name: [packed(column, 'f4') for column in values.T]
         for name, values in (('measured', measured), ('predicted', predicted))}}
@@ -197,11 +184,7 @@ def path_entry(points: FloatArray) -> dict[str, Packed]:
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON object of a track's row in the table of tracks.
-
-    `entry` is `TrackLog.summary()`, or the entry of a track in `summary.json`, which may contain
-    `truth`.
-    """
+    """JSON object of a row in the table of tracks, from an entry of `summary.json`."""
     truth = entry.get('truth', {})
     error = next((truth[key] for key in ('closest', 'position_mean')
                   if isinstance(truth.get(key), float) and np.isfinite(truth[key])), None)
@@ -215,11 +198,7 @@ def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """Weight and best hypothesis of each arrival direction.
-
-    At a pose for which no hypothesis has this direction, the weight is 0 and the other values are
-    NaN.
-    """
+    """Weight and best hypothesis of each arrival direction; weight 0 and NaN without one."""
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):

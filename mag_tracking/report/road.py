@@ -12,7 +12,6 @@ from mag_tracking.arrays import BoolArray, FloatArray
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
 LANE_WIDTH_M = 3.5
-"""Width of a lane [m]."""
 SHOULDER_M = 1.0
 """Distance of the edge of the road from a sensor beside it [m]."""
 MAX_ANGLE = np.radians(15.0)
@@ -34,11 +33,10 @@ class Road:
 
 
 def road_of(sensors: FloatArray, paths: Sequence[FloatArray]) -> Road:
-    """Infer the road on which vehicles have passed a network, from positions in the world frame
-    [m].
+    """Infer the road on which vehicles have passed a network, from positions [m, world frame].
 
-    The carriageway is straight and as wide as the paths along it. If sensors stand on both sides,
-    it fills the space between them. A path that leaves it is surrounded by a side road.
+    The carriageway is straight and as wide as the paths along it, and fills the space between
+    sensors on both sides. A path that leaves it is surrounded by a side road.
     """
     paths = [path for path in map(_thinned, paths) if len(path) > 2]
     if not paths:
@@ -146,6 +144,5 @@ def _outline(part: FloatArray) -> FloatArray:
 
 
 def _unit(v: FloatArray) -> FloatArray:
-    """Unit vector in the direction of `v` (2,)."""
     unit: FloatArray = v / np.hypot(*v)
     return unit

@@ -17,7 +17,6 @@ BLUE, VERMILLION, GREEN, ORANGE, PINK, SKY = (
 SERIES_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY)
 """Colours of curves, in order; vermillion is reserved for smoothed tracks."""
 AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
-"""Colours of the axes x, y, z."""
 MINOR_LABEL_DECADES = 1.5
 """Range of a logarithmic axis [decades] up to which values between powers of ten are labelled."""
 DOTS_PER_INCH = 110
@@ -58,10 +57,7 @@ def legend_beside(axes: 'Axes') -> None:
 
 
 def plain_log_ticks(axes: 'Axes') -> None:
-    """Label a logarithmic y axis with plain numbers such as 0.02 and 3 instead of powers of ten.
-
-    An axis that spans more than six decades is left unchanged.
-    """
+    """Label a logarithmic y axis of up to six decades with plain numbers such as 0.02 and 3."""
     # Imported here because pages, which use the colours and units, do not need matplotlib.
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -75,10 +71,7 @@ def plain_log_ticks(axes: 'Axes') -> None:
 
 
 def save_figure(figure: 'Figure', path: str | PathLike[str]) -> None:
-    """Write a figure in the format that the file suffix selects; replaces an existing file or link.
-
-    Raises OSError if the file cannot be written.
-    """
+    """Write a figure in the format of the suffix, in place of any file or link; raises OSError."""
     image = io.BytesIO()
     figure.savefig(image, format=Path(path).suffix.removeprefix('.').lower(), dpi=DOTS_PER_INCH)
     with new_binary_file(path) as stream:

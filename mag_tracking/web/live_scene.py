@@ -37,10 +37,7 @@ looped bag causes such a jump."""
 
 
 class LiveTrack:
-    """Track of a live page, which stores the poses and counts the poses that have been sent.
-
-    `key` is unique on the page; track ids are not, because a restarted tracker begins at 1.
-    """
+    """Track of a live page; `key` is unique, whereas a restarted tracker numbers from 1 again."""
 
     def __init__(self, key: int, track_id: int) -> None:
         self.key, self.log = key, TrackLog(track_id)
@@ -70,10 +67,7 @@ class LiveTrack:
             self._n_sent = max(0, self._n_sent - N_REMOVED)
 
     def unsent_entry(self, begin_ns: int) -> dict[str, Any]:
-        """JSON object with all unsent poses, which are then marked as sent.
-
-        `begin_ns` is the start of the scene.
-        """
+        """JSON object with all unsent poses of a scene from `begin_ns`, which count as sent now."""
         first, self._n_sent = self._n_sent, len(self.log.stamp_ns)
         self._is_end_sent = self.log.ended
         return self._entry(begin_ns, range(first, self._n_sent))
@@ -95,10 +89,7 @@ class LiveTrack:
 
 
 class LiveScene:
-    """Thread-safe state of a live page: collects records and creates messages for viewers.
-
-    Title and subtitle are sent with the next complete scene.
-    """
+    """Thread-safe state of a live page; titles are sent with the next complete scene."""
 
     def __init__(self, title: str, network: Sensors) -> None:
         self.title, self.subtitle = title, ''
@@ -117,7 +108,6 @@ class LiveScene:
             self._clear()
 
     def _clear(self) -> None:
-        """Discard all frames and tracks, and start a new scene."""
         self._begin_ns: int | None = None
         self._end_ns = self._frame_ns = 0
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
@@ -205,12 +195,10 @@ class LiveScene:
             return out
 
     def _n_sent_frames(self) -> int:
-        """Number of stored frames that have been sent."""
         return max(0, len(self._frames) - self._n_new_frames)
 
     def _rows_message(self, tracks: list[dict[str, Any]], smoothed: list[dict[str, Any] | None],
                       frames: list[FieldFrame]) -> str:
-        """JSON message with rows of tracks, smoothed paths, and frames."""
         begin_ns = self._begin_ns or 0
         return json_text({
             'type': 'rows', 'tracks': tracks, 'smoothed': smoothed,
@@ -228,12 +216,10 @@ class LiveScene:
                            'scene': scene})]
 
     def _health_message(self) -> str:
-        """JSON message with the notes and tables of the page."""
         return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                           'tables': [asdict(table) for table in self._tables]})
 
     def _extend_time(self, stamp_ns: int) -> None:
-        """Extend the time range of the scene to include a timestamp."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that may have been sent earlier had no start time.

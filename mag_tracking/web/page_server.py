@@ -37,28 +37,16 @@ LAG_TIMEOUT_S = 20.0
 MAX_VIEWERS = 100
 MAX_PORT = 65535
 STOP_TIMEOUT_S = 10.0
-"""[s] Maximum time to wait for the end of the server thread."""
 PAGE, STREAM = '/', '/stream'
 LOG = getLogger('mag_tracking.web')
 
 
 class PageServer:
-    """Server of the live page, for up to `MAX_VIEWERS` browsers.
+    """Server of the live page, for up to `MAX_VIEWERS` browsers; port 0 selects a free port.
 
-    Raises DeviceError if the port cannot be opened.
-
-    Parameters
-    ----------
-    host : str, optional
-        Local address to listen on. Unless it is a loopback address, browsers need the token in
-        `url`.
-    port : int, optional
-        TCP port; 0 selects a free port.
-
-    Attributes
-    ----------
-    url : address of the page, including the token if there is one
-    n_lagged : number of times that messages to a lagging viewer were suspended
+    `url` contains a token, which browsers need, unless `host` is a loopback address. `n_lagged`
+    counts suspensions of messages to a lagging viewer. Raises DeviceError if the port cannot be
+    opened.
     """
 
     def __init__(self, source: 'LiveScene', host: str = LOOPBACK, port: int = DEFAULT_PORT) -> None:
@@ -105,7 +93,6 @@ class PageServer:
         self.close()
 
     def _run(self) -> None:
-        """Run the event loop in the server thread until `close` is called."""
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._serve())
@@ -113,7 +100,6 @@ class PageServer:
             self._loop.close()
 
     async def _serve(self) -> None:
-        """Accept viewers and send updates until `close` is called."""
         # Malformed requests must not fill the log.
         LOG.addFilter(lambda record: record.msg != 'opening handshake failed')
         # Compression would be repeated for every viewer.
@@ -141,11 +127,8 @@ class PageServer:
             return [json_text({'type': 'fault', 'text': description})]
 
     def _send_updates(self) -> None:
-        """Send new messages to all viewers.
-
-        A lagging viewer receives the complete scene when its buffer is empty. A viewer whose buffer
-        has not shrunk for `LAG_TIMEOUT_S` is disconnected.
-        """
+        """Send new messages to all viewers; a lagging one receives the complete scene when its
+        buffer is empty, and is disconnected if that has not shrunk for `LAG_TIMEOUT_S`."""
         if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
@@ -182,8 +165,7 @@ class PageServer:
         self._viewers[viewer] = _buffered_bytes(viewer) + MAX_BUFFERED
 
     async def _handle_viewer(self, viewer: ServerConnection) -> None:
-        """Handle one connection until it closes; incoming messages are ignored."""
-        if len(self._viewers) + len(self._lagging) >= MAX_VIEWERS:
+        if self.n_viewers >= MAX_VIEWERS:
             await viewer.close(1013, 'too many viewers')
             return
         self._send_snapshot(viewer)
@@ -285,7 +267,6 @@ def _is_origin(parts: SplitResult | None) -> bool:
 
 
 def _buffered_bytes(viewer: ServerConnection) -> int:
-    """Size of a viewer's send buffer [bytes]."""
     return viewer.transport.get_write_buffer_size()
 
 
@@ -306,7 +287,6 @@ def _open_socket(host: str, port: int) -> socket.socket:
 
 def _response(status: HTTPStatus, body: bytes, media_type: str = 'text/plain',
               encoding: str = '') -> Response:
-    """HTTP response with security headers."""
     headers = Headers({
         'Content-Type': f'{media_type}; charset=utf-8', 'Content-Length': str(len(body)),
         'Cache-Control': 'no-store', 'Referrer-Policy': 'no-referrer', 'Connection': 'close',

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.passes import PassTracks, ground_prior
+from mag_tracking.apps.fit import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
 from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD
 from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world

@@ -166,6 +166,7 @@ def test_settings_are_read_from_a_file(tmp_path, capsys):
     (['--moment', '-1'], '--moment: '),
     (['--noise-std', '0.01'], '--noise-std: '),
     (['--figure', '/nowhere/board.png'], '/nowhere'),
+    (['--figure', 'board.xyz'], 'board.xyz'),
     (['--params', '/nowhere.yaml'], '/nowhere.yaml')])
 def test_invalid_options_are_named(tmp_path, capsys, options, message):
     assert command(FOLDER / 'poses.csv', '--sensors', POSITIONS_FILE, *options,

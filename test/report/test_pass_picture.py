@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mag_tracking as mt
-from mag_tracking.report.pass_picture import N_VEHICLES
+from mag_tracking.report.figures import N_VEHICLES
 from support.bundled import DATA
 
 

@@ -1,6 +1,6 @@
 """Passes and fits of readings that are fed as by live sensors, without a prescan."""
 
-from mag_tracking.apps.passes import PassCollector, PassFitter
+from mag_tracking.apps.fit import PassCollector, PassFitter
 from mag_tracking.pipeline import Pipeline, Step, settings_for
 from mag_tracking.records import Readings
 
