@@ -138,10 +138,11 @@ def test_the_wheel_contains_all_required_files_and_no_others(tmp_path, tree_copy
     for name in UNRELATED_FILES:
         (tree_copy / name).parent.mkdir(parents=True, exist_ok=True)
         (tree_copy / name).write_text('')
-    # The compiled modules are not run, so they are built without optimisation and for one
-    # processor, which is faster.
+    # The compiled modules are not run here, and `make` has compiled them: a program that only makes
+    # the files that a compiler would make saves a minute.
     compiler = tmp_path / 'compiler'
-    compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
+    compiler.write_text('#!/bin/sh\nfor word; do\n  [ "$last" = -o ] && : > "$word"\n'
+                        '  last=$word\ndone\nexit 0\n')
     compiler.chmod(0o755)
     run(sys.executable, '-c', 'import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])',
         tmp_path, cwd=tree_copy, CC=str(compiler), CXX=str(compiler),

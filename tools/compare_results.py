@@ -2,9 +2,9 @@
 
     .venv/bin/python tools/compare_results.py BASE          # working tree against commit BASE
 
-Every bundled recording is replayed with both versions from the command line. Every number in
-poses.csv, poses_smoothed.csv, detections.csv and hypotheses.csv must agree within the tolerance;
-every string and the number of rows must be identical. The exit status is 1 if any value differs.
+Every bundled recording is replayed with both versions from the command line, with all tables.
+Every number in every CSV file must agree within the tolerance; every string and the number of rows
+must be identical. The exit status is 1 if any value differs or a file is missing.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / 'test' / 'data'
-TABLES = ('poses.csv', 'poses_smoothed.csv', 'detections.csv', 'hypotheses.csv')
+TABLES = {'vehicle': 'poses,passages,events,fits', 'magnet': 'poses,events'}
 
 
 def mag_tracking(tree, *arguments):
@@ -60,7 +60,7 @@ def replay_all(tree, out, workers):
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(lambda r: mag_tracking(
             tree, 'replay', r[1], '--network', r[2], '--target', r[3], '--out', out / r[0],
-            '--no-figures'), jobs))
+            '--tables', TABLES[r[3]], '--no-figures'), jobs))
     return [name for name, *_ in jobs]
 
 
@@ -79,6 +79,8 @@ def difference(one, other):
 
 def compare(one, other, renamed):
     """Compare two CSV files; return (n_rows, n_values, largest difference, its location)."""
+    if not other.exists():
+        return 0, 0, math.inf, f'{other} is missing'
     with open(one, newline='') as a, open(other, newline='') as b:
         rows, other_rows = list(csv.reader(a)), list(csv.reader(b))
     if len(rows) != len(other_rows) or rows[0] != other_rows[0]:
@@ -121,7 +123,7 @@ def main():
     names = replay_all(ROOT, build / 'results', args.workers)
     failed = False
     for name in names:
-        for table in TABLES:
+        for table in sorted(p.name for p in (base_results / name).glob('*.csv')):
             n_rows, n, worst, where = compare(
                 base_results / name / table, build / 'results' / name / table, args.renamed)
             is_different = worst > args.tolerance

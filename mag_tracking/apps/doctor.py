@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 
 import numpy as np
 
-from mag_tracking.calibration.survey import SurveySettings
+from mag_tracking.calibration.agreement import SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, Step
 from mag_tracking.recording.message_block import Progress

@@ -15,6 +15,10 @@ import numpy as np
 from scipy.special import chdtrc
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.settings import param
+
+COMPASS_BIAS_STD = 6e-7
+"""[T] Prior standard deviation, per axis, of the field of a sensor and of nearby iron."""
 
 FALSE_ALARM_PROBABILITY = 1e-5
 """Probability that a correct sensor is reported."""
@@ -47,6 +51,21 @@ _AXES = 'xyz'
 
 _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 """Description, order and signs (3,) of a signed permutation of the axes."""
+
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """Settings of the survey of orientations and clock offsets."""
+
+    offset_std: float = param(
+        5e-6, 'Standard deviation, per axis, of the constant offset of an uncalibrated sensor, '
+        'including iron nearby. An offset does not affect tracks. If the background of a sensor '
+        'contradicts the field of the Earth by more than this offset and the uncertainty of its '
+        'orientation explain, its gain, its axes or its orientation are wrong, and its tracks are '
+        'ambiguous. 0 disables this flag.', 'T', (0.0, 1e-3))
+    nominal_std_deg: float = param(
+        5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
+        'sensors without orientation_std_deg.', 'deg', (0.06, 180.0))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
+from mag_tracking.calibration.agreement import (
+    COMPASS_BIAS_STD,
+    FieldInconsistency,
+    SurveySettings,
+    consensus,
+    disagreements,
+)
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.clock import Lag, knock_lag, shock
 from mag_tracking.calibration.orientation import (
@@ -26,14 +32,10 @@ from mag_tracking.calibration.orientation import (
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import AccelerationSample
-from mag_tracking.settings import param
 from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
 """[s] Maximum gap between accelerations of one recording; earlier readings are discarded."""
-
-COMPASS_BIAS_STD = 6e-7
-"""[T] Prior standard deviation, per axis, of the field of a sensor and of nearby iron."""
 
 ACCELEROMETER_BIAS = 0.05
 """[m/s²] Bias of an accelerometer, per axis; it tilts the estimated vertical by 0.3 degrees."""
@@ -46,21 +48,6 @@ MAX_ACCELERATIONS = 60_000
 
 MIN_NOMINAL_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
-
-
-@dataclass(frozen=True)
-class SurveySettings:
-    """Settings of the survey of orientations and clock offsets."""
-
-    offset_std: float = param(
-        5e-6, 'Standard deviation, per axis, of the constant offset of an uncalibrated sensor, '
-        'including iron nearby. An offset does not affect tracks. If the background of a sensor '
-        'contradicts the field of the Earth by more than this offset and the uncertainty of its '
-        'orientation explain, its gain, its axes or its orientation are wrong, and its tracks are '
-        'ambiguous. 0 disables this flag.', 'T', (0.0, 1e-3))
-    nominal_std_deg: float = param(
-        5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
-        'sensors without orientation_std_deg.', 'deg', (0.06, 180.0))
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ from mag_tracking.recording.message_block import MessageBlock, Progress
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
-from mag_tracking.stages.health.clocks import ClockSpan
-from mag_tracking.stages.health.findings import ZERO_STAMP
+from mag_tracking.stages.health.clocks import ZERO_STAMP, ClockSpan
 from mag_tracking.units import NS
 
 N_FIRST_MESSAGES = 200

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mag_tracking.calibration import survey as survey_stage
-from mag_tracking.calibration.survey import Survey, SurveySettings
+from mag_tracking.calibration.agreement import SurveySettings
+from mag_tracking.calibration.survey import Survey
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.file import read_network, write_network

@@ -183,5 +183,5 @@ def test_ros_is_shut_down_in_one_module_only(path):
     names = {ast.unparse(node) for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Attribute)}
     shutdown = names & {'rclpy.try_shutdown', 'rclpy.shutdown', 'node.destroy_node'}
-    assert shutdown == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'shutdown'
+    assert shutdown == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'middleware'
                         else set())

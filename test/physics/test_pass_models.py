@@ -71,9 +71,9 @@ def test_a_row_of_negative_length_is_reversed():
 def test_a_row_far_away_has_the_field_of_one_dipole():
     path, moments = np.array([1.0, 2.0, 0.5, 3.0, 1.0, 0.0, 2.0]), RNG.standard_normal((3, 3))
     errors = []
-    for distance in (60.0, 120.0):
+    for distance in (60.0, 600.0):
         row, dipole = (RowPass(T, POSITIONS + [distance, 0.0, 0.0], M, d) for d in (3, 1))
         field = row.basis(path[None])[0] @ (row.combinations.T @ moments.ravel())
         expected = dipole.basis(path[None, :6])[0] @ moments.sum(axis=0)
         errors.append(np.abs(field - expected).max() / np.abs(expected).max())
-    assert errors[0] < 0.1 and errors[1] < 0.6 * errors[0]
+    assert errors[0] < 0.1 and errors[1] < 0.2 * errors[0]

@@ -13,7 +13,7 @@ NAME = 'straight_small_left'
 
 
 def test_a_missing_rerun_sdk_is_reported_before_the_replay(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr('mag_tracking.results.rerun_file.find_spec', lambda _: None)
+    monkeypatch.setattr('mag_tracking.results.track_files.find_spec', lambda _: None)
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--rerun',
                  '--out', str(tmp_path / 'out')]) == 1
     assert 'rerun-sdk' in capsys.readouterr().err

@@ -5,9 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
+from mag_tracking.calibration import agreement
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted, updated
-from mag_tracking.calibration.survey import COMPASS_BIAS_STD, SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 
@@ -15,19 +14,19 @@ MIN_CHANGE = 1e-7
 """[T] Change of a background after which it is compared again; harmful faults exceed 1e-5."""
 
 
-def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
-                        levels: FloatArray) -> list[FieldInconsistency]:
+def compared_with_earth(network: SensorNetwork, survey: agreement.SurveySettings,
+                        levels: FloatArray) -> list[agreement.FieldInconsistency]:
     """Find the sensors whose `levels` (n, 3) [T] without a target contradict the Earth's field, or,
     if it is unknown, their median; raises ValueError if fewer than three then report all axes."""
     std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
                     for s in network.orientation_std])
-    earth_field = consensus(levels, network.R_ws) if network.earth_field is None \
+    earth_field = agreement.consensus(levels, network.R_ws) if network.earth_field is None \
         else network.earth_field
-    return disagreements(network.names, levels, network.R_ws, std, earth_field,
-                         COMPASS_BIAS_STD, survey.offset_std)
+    return agreement.disagreements(network.names, levels, network.R_ws, std, earth_field,
+                                   agreement.COMPASS_BIAS_STD, survey.offset_std)
 
 
-def earth_field_findings(inconsistencies: Iterable[FieldInconsistency]) -> list[Finding]:
+def earth_field_findings(inconsistencies: Iterable[agreement.FieldInconsistency]) -> list[Finding]:
     """Findings about sensors that contradict the Earth's field; serious if the sensor misleads."""
     return [Finding(d.misleads, d.sensor, str(d).removeprefix(f'{d.sensor} ')
                     + ('; all its tracks are ambiguous' if d.misleads else ''), d.advice,
@@ -37,9 +36,9 @@ def earth_field_findings(inconsistencies: Iterable[FieldInconsistency]) -> list[
 class FieldComparison:
     """Times at which the background of a sensor contradicts the Earth's field."""
 
-    def __init__(self, network: SensorNetwork, survey: SurveySettings) -> None:
+    def __init__(self, network: SensorNetwork, survey: agreement.SurveySettings) -> None:
         self._survey = survey
-        self._found: dict[str, FieldInconsistency] = {}
+        self._found: dict[str, agreement.FieldInconsistency] = {}
         # Intervals of each sensor that was compared.
         self._times: dict[str, DoubtfulTimes] = {}
         self.use(network)
@@ -85,6 +84,6 @@ class FieldComparison:
         if sensor in self._times:
             self._times[sensor] = shifted(self._times[sensor], ns)
 
-    def inconsistencies(self) -> list[FieldInconsistency]:
+    def inconsistencies(self) -> list[agreement.FieldInconsistency]:
         """Latest misleading inconsistency of each sensor, in the order of the network."""
         return [self._found[name] for name in self._network.names if name in self._found]

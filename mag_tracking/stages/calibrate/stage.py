@@ -9,13 +9,13 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, Record, are_equal
 from mag_tracking.calibration import core, doubtful_times
+from mag_tracking.calibration.agreement import SurveySettings
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.sensor_state import clear_spikes, new_sensors
-from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import NetworkError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain

@@ -37,6 +37,8 @@ UNITS = ((1e3, 'the seconds of its timestamps are milliseconds'),
 """Factor by which the timestamps advance too fast, and the reason."""
 MAX_RATIO_ERROR = 0.1
 """Maximum relative error of this factor; of clocks that are compared, it is 1."""
+ZERO_STAMP = 'message with header.stamp 0'
+"""Cause for which a message without a timestamp is rejected."""
 UPDATE_INTERVAL = 64
 """Number of new readings of a sensor after which its timestamps are examined again."""
 CAUSES = {

@@ -19,8 +19,6 @@ from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
 """Time for which a background may be frozen before it is reported [s]."""
-ZERO_STAMP = 'message with header.stamp 0'
-"""Cause for which a message without a timestamp is rejected."""
 MIN_SERIOUS = 100
 """Number of readings rejected for one cause above which results are assumed to be wrong."""
 ADVICE = {
@@ -108,7 +106,8 @@ def source_findings(name: str, lost: Mapping[str, int],
                     rejected: Mapping[str, int]) -> list[Finding]:
     """Report the unreadable parts (`lost`) and `rejected` messages of the source `name`."""
     found = []
-    without_time = {fault: n for fault, n in rejected.items() if fault.startswith(ZERO_STAMP)}
+    without_time = {fault: n for fault, n in rejected.items()
+                    if fault.startswith(clocks.ZERO_STAMP)}
     for counts, advice, cause in (
             (lost, 'the recording is damaged; mag-tracking repair adds the missing '
              'index of a truncated file, but cannot restore lost data', Cause.DAMAGED_RECORDING),
