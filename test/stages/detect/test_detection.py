@@ -137,7 +137,7 @@ def test_the_energy_includes_only_present_axes():
     C[1, 0, 0] = -1.0
     with pytest.raises(np.linalg.LinAlgError, match='definite'):
         whitened_energy(y, C)
-    with pytest.raises(ValueError, match=r'covariances \(n, 3, 3\), got \(3, 3\) and \(2, 3, 3\)'):
+    with pytest.raises(ValueError, match='C: shape does not match'):
         whitened_energy(y, C[:2])
 
 
