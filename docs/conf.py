@@ -82,5 +82,6 @@ def clear_alias(_app, _what, _name, _value, _options, lines):
 
 def setup(app):
     """Write the generated pages before Sphinx reads the sources."""
-    app.connect('builder-inited', lambda _: write_pages())
+    # Before autosummary, which would look for the modules of an earlier build.
+    app.connect('builder-inited', lambda _: write_pages(), priority=100)
     app.connect('autodoc-process-docstring', clear_alias)

@@ -223,7 +223,10 @@ def read_model(path: FilePath) -> SignatureModel:
         return _parse_model(content)
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (ValueError, RecursionError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RecordingError(f'{path} is not a valid file of trained classes: '
+                             'it is not valid JSON') from error
+    except ValueError as error:
         raise RecordingError(f'{path} is not a valid file of trained classes: {error}') from error
 
 

@@ -58,7 +58,7 @@ def test_passes_of_different_vehicles_cause_a_warning(passes, tmp_path, capsys):
 
 @pytest.mark.parametrize('soft, n', [(-0.29, 0), (-0.31, 1)])
 def test_only_a_significantly_negative_soft_iron_causes_a_warning(soft, n):
-    iron = Iron(np.zeros(3), soft, np.eye(4), np.zeros((2, 3)), 1.0)
+    iron = Iron(np.zeros(3), soft, np.eye(4), 1.0)
     assert len([w for w in iron_warnings(iron, 2, 0.1) if 'negative' in w]) == n
 
 
