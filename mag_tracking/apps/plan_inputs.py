@@ -57,6 +57,12 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None,
                               float(np.median(sampling.noise_std)),
                               energy_threshold(settings.detect.false_alarm_probability, 3)))
     sampling = replace(sampling, half_window=1.2 * range_m / planned_target.speed)
+    if sampling.half_window < sampling.period:
+        # A single frame does not separate the field from the unknown background.
+        raise SettingsError(
+            f'speed: expected less than {1.2 * range_m / sampling.period:.3g} m/s, got {speed:g}: '
+            f'a faster target is within {1.2 * range_m:.3g} m of a sensor for less than two frames '
+            f'of {sampling.period:.3g} s (align.period_s, rate)')
     if clearance is None:
         clearance = CLEARANCE if moment is None else 0.0
     return PlanInputs(network, planned_target, sampling, lanes,

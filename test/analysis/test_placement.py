@@ -195,6 +195,8 @@ def test_plan_writes_all_its_files(tmp_path, capsys):
     (['--area', '0', '0', '1', '1000'], '--area: '),
     (['--heading', '0', '0'], 'lanes'),
     (['--target', 'magnet'], '--moment: '),
+    (['--target', 'magnet', '--moment', '0.5', '--height', '0.3'],
+     '--speed: expected less than 5.23 m/s, got 10: '),
 ])
 def test_plan_rejects_invalid_options(tmp_path, capsys, options, message):
     assert main(['plan', '--network', str(NETWORK_FILE), *options,
