@@ -16,13 +16,13 @@ import yaml
 from mag_tracking.errors import MagTrackingError, OutputError
 
 MAX_NODES = 1_000_000
-"""Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
+"""Maximum number of keys, values, lists and mappings of a YAML file with aliases expanded."""
 MAX_ENTRIES = 1000
 """Maximum number of entries of a mapping. The parser needs half a minute for 10,000 sensors."""
 MAX_BYTES = 2_000_000
-"""Maximum size of a file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
+"""Maximum size of a YAML file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
 MAX_DEPTH = 64
-"""Maximum depth of lists and mappings after expansion of aliases."""
+"""Maximum depth of lists and mappings in a YAML file after expansion of aliases."""
 MAX_BITS = 14_000
 """Maximum size of an integer [bits]. Python does not format more than 4300 decimal digits."""
 _REPR = Repr()

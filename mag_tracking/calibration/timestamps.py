@@ -29,9 +29,20 @@ MAX_INTERVAL_STEPS = 3
 ROUND_STEPS_NS = np.array([m * 10**k for k in range(5, 10) for m in (1, 2, 4, 5)] + [16_666_667])
 """[ns] Steps of coarse clocks; other steps are those of packets."""
 
-TimestampError = enum.Enum('TimestampError', 'ZERO COARSE PACKET BURST UNIT')
-"""Kind of a regular error of timestamps: all are zero, the clock has steps, several readings have
-the timestamp of their packet or of their common arrival, nanoseconds are in another unit."""
+
+class TimestampError(enum.Enum):
+    """Kind of a regular error of timestamps."""
+
+    ZERO = enum.auto()
+    """All timestamps are zero."""
+    COARSE = enum.auto()
+    """The clock has steps."""
+    PACKET = enum.auto()
+    """Several readings have the timestamp of their packet."""
+    BURST = enum.auto()
+    """Several readings have the timestamp of their common arrival."""
+    UNIT = enum.auto()
+    """The nanoseconds are written in another unit."""
 
 
 @dataclass(frozen=True)

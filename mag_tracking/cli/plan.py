@@ -115,6 +115,7 @@ def _write(p: Plan, out: Path) -> None:
     from mag_tracking.apps import plan_report
     from mag_tracking.report.style import save_figure
 
-    for name in ('position', 'detection', 'sensor', 'lane'):
-        figure = getattr(plan_report, f'{name}_figure')(p)
-        save_figure(figure, out / f'plan_{name}{"s" * (name == "lane")}.png')
+    save_figure(plan_report.position_figure(p), out / 'plan_position.png')
+    save_figure(plan_report.detection_figure(p), out / 'plan_detection.png')
+    save_figure(plan_report.sensor_figure(p), out / 'plan_sensor.png')
+    save_figure(plan_report.lane_figure(p), out / 'plan_lanes.png')

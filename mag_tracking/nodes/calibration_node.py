@@ -264,10 +264,12 @@ class CalibrationNode(StageNode):
         fields = {name: self._stage.background(name)
                   for name, background in self._stage.backgrounds().items()
                   if background.certain and self._stage.last_stamp_ns(name) is not None}
-        if not fields or not self._survey.counts['accelerations']:
-            response.message = 'no background has been learnt yet; keep targets away for a while' \
-                if not fields else 'no acceleration received on ' + ', '.join(
-                    map(self.resolve_topic_name, filter(None, self.network.imu_topics)))
+        if not fields:
+            response.message = 'no background has been learnt yet; keep targets away for a while'
+            return None
+        if not self._survey.counts['accelerations']:
+            response.message = 'no acceleration received on ' + ', '.join(
+                map(self.resolve_topic_name, filter(None, self.network.imu_topics)))
             return None
         date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
         solution = self._survey.solve(fields, date)

@@ -120,9 +120,12 @@ def flush() -> None:
 def _final_message() -> bytes:
     """Return the pending error, if any, which would otherwise be lost, and the timeout message."""
     error = sys.exc_info()[1]
-    pending = '' if error is None or isinstance(error, KeyboardInterrupt) else \
-        f'{error}\n' if isinstance(error, MagTrackingError) else \
-        ''.join(traceback.format_exception(error))
+    if error is None or isinstance(error, KeyboardInterrupt):
+        pending = ''
+    elif isinstance(error, MagTrackingError):
+        pending = f'{error}\n'
+    else:
+        pending = ''.join(traceback.format_exception(error))
     return (pending + HUNG_MESSAGE).encode(errors='backslashreplace')
 
 

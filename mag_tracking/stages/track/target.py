@@ -24,9 +24,13 @@ START_BYTES = 250_000_000
 after the frames before the detection if few hypotheses are then probable, otherwise later."""
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track, those nearest to the strongest field."""
-WIDER_BYTES, MIN_HYPOTHESES, MIN_WEIGHT = 100_000_000, 100, 0.999
-"""Limits when the remaining sensors are added: memory of the covariances [bytes], minimum number of
-hypotheses even beyond it, and minimum weight of these, so that doubt is not lost."""
+WIDER_BYTES = 100_000_000
+"""Maximum memory of the covariances after the remaining sensors have been added [bytes]."""
+MIN_HYPOTHESES = 100
+"""Minimum number of retained hypotheses, even if they exceed `WIDER_BYTES`."""
+MIN_WEIGHT = 0.999
+"""Minimum total weight of the hypotheses that are retained when the remaining sensors are added. If
+more weight were dropped, the track would appear more certain than the frames justify."""
 _FLOAT_BYTES = 8
 
 
