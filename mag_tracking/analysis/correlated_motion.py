@@ -24,24 +24,33 @@ MIN_CORRELATION = 0.97
 """Minimum fraction of the energy of one field that is explained by the other, delayed field."""
 MIN_PEAK = 0.7
 """Minimum height of a correlation maximum relative to the highest maximum."""
-N_COARSE, MAX_PAIRS = 512, 12
-"""Number of samples in the search for correlation maxima, and of compared pairs (the closest)."""
+N_COARSE = 512
+"""Number of field samples in the search for correlation maxima."""
+MAX_PAIRS = 12
+"""Maximum number of pairs of sensors; the closest pairs are compared."""
 SCALE_STD, GAIN_STD, ROTATION_STD = 0.05, 0.02, np.deg2rad(2.0)
 """Prior standard deviations of the differences between the fields at two sensors: common scale
-(distance to the target), gain of each axis, and rotation [rad] about each axis."""
+(distance to the target), gain of each axis, and rotation [rad] about each axis of a sensor that is
+mounted carefully."""
 MIN_DELAY = 3.0
 """Minimum delay in standard deviations; a smaller delay is not significant."""
 RELATIVE_KERNEL_WIDTH, MAX_DELAY_SHIFT = 0.3, 4.0
 """Width of the smoothing kernel relative to the RMS duration of the field, and maximum shift of a
-delay during the refinement in these widths."""
+delay during the refinement in these widths; a larger shift leads to a different maximum."""
+MAX_GAUSS_NEWTON_STEPS = 20
+"""Maximum number of steps of the refinement, which usually converges earlier."""
 MAX_PRIOR_CHI2 = 22.5
 """Maximum joint chi-square of rotation, scale and gains of equal fields (probability 0.001)."""
 MIN_DIFFERENCE_STDS, MIN_RELATIVE_DIFFERENCE = 3.0, 0.1
 """Minimum difference of contradicting speeds: in standard deviations, and relative to the speed."""
 MIN_COSINE = 0.3
-"""Minimum cosine of the angle between the heading and the line through both sensors."""
-MIN_SAMPLES, MAX_READINGS = 10, 1_000_000
-"""Minimum number of readings of each sensor, and maximum number of resampled readings of a pair."""
+"""Minimum cosine of the angle between the heading and the line through both sensors. At a smaller
+cosine, the target crosses the line, and its speed is not compared."""
+MIN_SAMPLES = 10
+"""Minimum number of readings of each sensor."""
+MAX_READINGS = 1_000_000
+"""Maximum number of resampled readings of a pair. A pair that requires more, due to irregular
+timestamps, is rejected."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,7 @@ class PairDelay:
     delay: float
     """Delay of the second sensor after the first [s]."""
     delay_std: float
+    """Standard deviation of `delay` [s]."""
     similarity: float
     """Fraction of the energy of the second field that is explained by the delayed first field."""
 
@@ -107,7 +117,8 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
     """Whether a speed and a heading, each with its std, contradict the delays between the sensors.
 
     On a path oblique to the line through the sensors, the delay is shorter than along the line. A
-    path almost perpendicular to it, or an unknown value, never contradicts the delays.
+    path almost perpendicular to it, or an unknown value, never contradicts the delays. A
+    significantly opposite heading always does.
     """
     if delay.reason or not np.isfinite([*speed, *heading]).all():
         return False
@@ -266,7 +277,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         # With such a long delay, the two fields hardly overlap.
         return tau, np.inf, 0.0
     std = norm / np.sqrt(y.size)
-    for _ in range(20):
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
         residuals, J = _residuals(pair, t, y, theta)
         # Smoothing reduces noise, but not the quantisation error of a coarse sensor.
         std = max(float(np.linalg.norm(residuals)) / np.sqrt(dof), pair.noise, 1e-6 * norm)

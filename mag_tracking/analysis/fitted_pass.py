@@ -31,8 +31,11 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 
 
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
-    """Return the fit with the smallest criterion, or None if that fit is rejected, because a fit
-    with fewer dipoles may not reveal that the target turned."""
+    """Return the fit with the smallest criterion, or None if that fit is rejected.
+
+    Another order does not replace a rejected fit, because a fit with fewer dipoles does not always
+    reveal that the target turned.
+    """
     criteria = order_criteria(fits)
     if not len(fits) or not np.isfinite(criteria).any():
         return None

@@ -17,11 +17,13 @@ from mag_tracking.physics.bounds import ADVICE, impossible_reason
 POINT_REACH = 2.1
 """[m] Reach of the iron of a car from a single dipole. At distance r, the model error relative to
 the field is the reach over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51
-(T10 Table 6.1, TSP14 Table I), with 87 times the noise energy per value on average over the
-pass."""
+(T10 Table 6.1, TSP14 Table I). Their signal energy was 1200 times the noise energy at the CPA (T10
+eq. (6.1)), or 87 times per value on average over the pass. Three cars left 10 to 18 % of the energy
+unexplained; the fourth, with 57 %, cannot be modelled as a point."""
 ROW_REACH, MIN_ROW_REACH = 0.45, 0.4
-"""Reach of the iron from a row, relative to the spacing of its dipoles, and at least [m], from the
-costs of cars and trucks with three dipoles in T10 Table 6.5 and TSP14 Table II."""
+"""Reach of the iron from a row, relative to the spacing of its dipoles, and at least [m] (from the
+cars). With three dipoles, T10 Table 6.5 and TSP14 Table II report costs of 1.3 to 1.6 for cars, and
+of 77 to 303 for trucks with twenty times the energy. These costs correspond to 0.15 to 0.45."""
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
 MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE = 0.003, 0.1

@@ -32,7 +32,7 @@ class Decimator:
     The filter has linear phase, and its delay is subtracted from the timestamps ([T10]_ section 6.3
     reduces 100 Hz to 12.5 Hz likewise). The rate is measured from the first samples; `factor`, the
     ratio of input to output rate, is None until then. The filter restarts after a gap or clock
-    step.
+    step, because filtering across it would produce an invalid field.
     """
 
     def __init__(self, rate: float) -> None:

@@ -104,8 +104,8 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
 
     `r0` [m] is the position at time zero relative to the sensor, `std` [m] that of the range
     (zero in TSP14). A range of zero, if `r0` is parallel to `v0`, does not make the scale
-    observable. TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
-    Proposition 2 lacks a minus sign.
+    observable (TSP14 Proposition 2). TSP14 eq. (35)-(37); the gradient with respect to v0 printed
+    in the proof of Proposition 2 lacks a minus sign.
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
     t_cpa = -(r0 @ v0) / (v0 @ v0)
@@ -159,9 +159,10 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
     """Distance [m] across the axis of a dipole at which one sample has the energy `ratio`.
 
-    Along the axis it is larger by a factor of 2^(1/3). `moment` is in A m², `noise_std` in T per
-    axis; `ratio` is 9.2 in T10. T10 eq. (5.20)-(5.24): eq. (5.23) prints the squared norm of R
-    instead of the norm; moment and noise in eq. (5.22) are too small by a factor of about 450.
+    Along the axis it is larger by a factor of 2^(1/3). `moment` is in A m² (300-600 for a car, 1800
+    for a truck), `noise_std` in T per axis (1.1e-8 in TSP14); `ratio` is 9.2 in T10. T10
+    eq. (5.20)-(5.24): eq. (5.23) prints the squared norm of R instead of the norm; moment and noise
+    in eq. (5.22) are too small by a factor of about 450.
     """
     return np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
 

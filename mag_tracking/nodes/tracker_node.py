@@ -108,7 +108,10 @@ class TrackerNode(stage_node.StageNode):
         return {'track': self._stage, 'traffic': self._traffic}
 
     def end_tracks_on_timeout(self) -> None:
-        """End the tracks if frames no longer arrive, except during a replay, which may pause."""
+        """End the tracks if frames no longer arrive, except during a replay, which may pause.
+
+        The time of arrival is used, because timestamps may be wrong.
+        """
         if self._stage.bank is None or self.is_replayed:
             return
         last_received = self.flows['detection'].last_received

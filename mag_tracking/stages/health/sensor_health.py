@@ -21,7 +21,8 @@ UPDATE_INTERVAL = 64
 CLOCK_STEP_S = 0.25
 """[s] Minimum jump of a timestamp that counts as a clock step if the time of receipt is regular."""
 MAX_LIVE_DELAY_S = 86400.0
-"""[s] Maximum age of live timestamps; `apps.doctor` compares the clocks of sensors."""
+"""[s] Maximum age of live timestamps. Older timestamps come from a replay or an unsynchronised
+clock; `apps.doctor` compares the clocks of the sensors."""
 GAP_RATIO = 1.5
 """Readings are counted as lost if the ratio of an interval to the median interval exceeds this."""
 MAX_JITTER = 0.3

@@ -80,7 +80,8 @@ class ClockComparison:
 
     def largest_offset_s(self, rows: IntArray) -> float:
         """Largest significant offset between the clocks of two of the sensors `rows` of the
-        network, else 0; a clock needs two passes, because one may contain two vehicles."""
+        network; 0 if none is significant."""
+        # Clocks that were compared in only one pass are ignored: it may contain two vehicles.
         repeated = rows[self._n_passes[rows] > 1]
         return float(self._offset_s[np.ix_(repeated, repeated)].max(initial=0.0))
 

@@ -26,7 +26,8 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 SENSORS_PER_REJECTION = 8
 """Number of measuring sensors for each sensor that may be rejected, at least one. If more must
-be rejected, the track itself is wrong; sensors far from the target fit any hypothesis."""
+be rejected, the track itself is wrong. A majority of fitting sensors does not confirm the track,
+because sensors far from the target fit any hypothesis."""
 
 
 def nearest_sensors(positions: FloatArray, position: FloatArray, n: int) -> IntArray:
