@@ -39,6 +39,8 @@ FORMER_SETTINGS = {
     'traffic.line_headings_deg': 'traffic.lines.road.heading_deg',
     'traffic.line_names': 'traffic.lines.names', 'traffic.class_names': 'traffic.classes.names'}
 """{former setting: its current name, for one row of a table; empty if it is a constant}."""
+TARGETS = 'vehicle', 'magnet', 'bench'
+"""Types of targets, for each of which the pipeline has default settings."""
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

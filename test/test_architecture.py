@@ -16,7 +16,7 @@ FILES = sorted(PACKAGE.rglob('*.py'))
 MAX_FILE_LINES, MAX_FUNCTION_LINES = 350, 40
 """Maximum lines of a file and of a function, without docstrings."""
 BUDGETS = {
-    'cli': 2730, 'nodes': 3590, 'apps': 5150, 'web': 540, 'report': 890, 'results': 1380,
+    'cli': 2750, 'nodes': 3590, 'apps': 5150, 'web': 540, 'report': 890, 'results': 1380,
     'drivers': 4700, 'recording': 4270, 'stages': 9880, 'messages': 1490, 'simulation': 120,
     'analysis': 2730, 'calibration': 5260, 'network': 730, 'physics': 1850, 'inference': 2780,
     'modules': 2500}

@@ -6,7 +6,7 @@
 from pathlib import Path
 
 from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
-from mag_tracking.settings import USER, to_yaml
+from mag_tracking.settings import TARGETS, USER, to_yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def generated():
     """Contents of all generated files: {path: content}."""
     # A bench differs from a magnet in a hand by a few settings, which the documentation lists.
-    assert set(TARGET_DEFAULTS) == {'vehicle', 'magnet', 'bench'}
+    assert {*TARGET_DEFAULTS} == {*TARGETS} == {'vehicle', 'magnet', 'bench'}
     return {ROOT / 'config' / 'default.yaml': to_yaml(Settings(), USER),
             ROOT / 'config' / 'magnet.yaml': to_yaml(settings_for('magnet'), USER)}
 

@@ -11,7 +11,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration import network_geometry, orientation
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
-from mag_tracking.calibration.network_fit import GeometrySettings
+from mag_tracking.calibration.network_fit import ASSUMED_NOISE, GeometrySettings
 from mag_tracking.calibration.survey import NetworkSurvey, Survey, with_measured_noise
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import CalibrationRecord, SensorNetwork
@@ -28,9 +28,6 @@ from mag_tracking.stages.stage import rejected
 
 MIN_POSES = 8
 """Minimum number of unambiguous poses of a track; shorter tracks are not used."""
-ASSUMED_NOISE = 1e-7
-"""Noise assumed for sensors of a board without a configured noise [T]. Near a magnet, the error of
-the field model is larger."""
 MIN_ROTATION_STD = 1e-7
 """Standard deviation below which an orientation is considered fixed, not estimated [rad]."""
 FIRST_ROW = 2

@@ -22,6 +22,9 @@ the board, offset and tilt of the magnet in the tool, log of the moment); per po
 ambient field)."""
 Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """Predicted readings and their derivatives; see `predicted_readings`."""
+ASSUMED_NOISE = 1e-7
+"""Noise assumed for sensors of a board without a configured noise [T]. Near a magnet, the error of
+the field model is larger."""
 OUTLIER_PROBABILITY = 1e-3
 """Readings whose residuals are less probable than this under the noise are down-weighted."""
 STEP_TOLERANCE = 1e-3

@@ -7,18 +7,21 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps import calibrate
-from mag_tracking.calibration.network_fit import GeometrySettings
+from mag_tracking.calibration.network_fit import ASSUMED_NOISE, GeometrySettings
 from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.quantities import quantity
 from mag_tracking.settings import flatten, read_parameter_file, replace
+
+if TYPE_CHECKING:
+    from mag_tracking.apps.calibrate import GeometrySurvey
 
 _GEOMETRY_HELP = '''
 Estimates the position, orientation, gain and bias of each sensor of a board from the readings
@@ -61,7 +64,7 @@ def add(commands: options.Commands) -> None:
     p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
     p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard deviation '
                    'of one reading, for sensors without noise_std in the network file '
-                   f'(default: {calibrate.ASSUMED_NOISE:g}, not written to the output)')
+                   f'(default: {ASSUMED_NOISE:g}, not written to the output)')
     p.add_argument('--unknown-poses', action='store_true',
                    help='estimate the poses of the magnet, if there is no tracker')
     for name, corner in (('--low', 'lower'), ('--high', 'upper')):
@@ -74,6 +77,9 @@ def add(commands: options.Commands) -> None:
 
 
 def _geometry(args: argparse.Namespace) -> int:
+    # Imported here because it loads the tracker.
+    from mag_tracking.apps import calibrate
+
     box = _checked_box(args)
     network = calibrate.board_of(args.sensors) if args.sensors else read_network(args.network)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
@@ -144,7 +150,7 @@ def _elapsed_time(task: str) -> Iterator[None]:
             ticker.join()
 
 
-def _print(survey: calibrate.GeometrySurvey, has_unknown_poses: bool) -> None:
+def _print(survey: 'GeometrySurvey', has_unknown_poses: bool) -> None:
     g = survey.geometry
     if g.converged:
         print('sensor      shift [mm]    rotation [deg] gain            '
@@ -169,7 +175,7 @@ def _print(survey: calibrate.GeometrySurvey, has_unknown_poses: bool) -> None:
               f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
     if n_assumed := sum(std is None for std in survey.network.noise_std):
         print(f'  note: noise of {quantity(n_assumed, "sensor")} assumed to be '
-              f'{calibrate.ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
+              f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
     for j, name in enumerate(survey.network.names):
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
@@ -180,7 +186,7 @@ def _print(survey: calibrate.GeometrySurvey, has_unknown_poses: bool) -> None:
               f'{", ".join(map(str, survey.suspect_rows))}')
 
 
-def _row(survey: calibrate.GeometrySurvey, j: int) -> str:
+def _row(survey: 'GeometrySurvey', j: int) -> str:
     g = survey.geometry
     shift = 1e3 * np.linalg.norm(survey.network.positions[j] - survey.nominal.positions[j])
     shift_std, rotation_std = (np.sqrt(np.square(v[j]).mean())

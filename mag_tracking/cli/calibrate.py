@@ -4,13 +4,11 @@ import argparse
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.calibrate import Calibration, calibrate, sensor_rows, tumble
-from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.cli import options
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -19,7 +17,11 @@ from mag_tracking.network.file import write_network
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import Readings
-from mag_tracking.run import ArraySource, RecordingSource
+
+if TYPE_CHECKING:
+    from mag_tracking.apps.calibrate import Calibration
+    from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
+    from mag_tracking.run import ArraySource, RecordingSource
 
 _NETWORK_HELP = '''
 Estimates the tilt (from the accelerometer), the heading (from the Earth's field), the clock offset
@@ -89,6 +91,9 @@ def _bar(args: argparse.Namespace, size: int | None) -> 'tqdm[NoReturn]':
 
 
 def _network(args: argparse.Namespace) -> int:
+    # Imported here, as in the other functions, because it loads scipy.
+    from mag_tracking.apps.calibrate import calibrate
+
     network = options.recorded_network(args)
     settings = options.settings_of(args, network)
     recording = Recording(args.recording)
@@ -119,7 +124,9 @@ def _network(args: argparse.Namespace) -> int:
     return 2 if result.survey.disagreements else 0
 
 
-def _print(result: Calibration, recording: Recording) -> None:
+def _print(result: 'Calibration', recording: Recording) -> None:
+    from mag_tracking.apps.calibrate import sensor_rows
+
     survey = result.survey
     print('sensor      tilt     heading [deg]    clock [ms]          noise [nT]           source')
     for name, tilt, heading, std, clock, clock_std, noise, source in sensor_rows(result.network):
@@ -147,6 +154,9 @@ def _print(result: Calibration, recording: Recording) -> None:
 
 
 def _tumble(args: argparse.Namespace) -> int:
+    from mag_tracking.apps.calibrate import tumble
+    from mag_tracking.run import RecordingSource
+
     magnitude = args.field_magnitude
     if magnitude is not None and not 1e-6 <= magnitude <= 1e-3:
         raise SettingsError(f'--field-magnitude: expected 1e-6 to 1e-3 T, got {magnitude:g}')
@@ -177,8 +187,9 @@ def _tumble(args: argparse.Namespace) -> int:
     return 0
 
 
-def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource | ArraySource:
+def _source(args: argparse.Namespace, network: SensorNetwork) -> 'RecordingSource | ArraySource':
     from mag_tracking.recording.field_table import SUFFIXES, read_field_table
+    from mag_tracking.run import ArraySource, RecordingSource
 
     if args.recording.suffix.lower() not in SUFFIXES:
         return RecordingSource(Recording(args.recording), network)
@@ -194,7 +205,7 @@ def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource
     return ArraySource(readings)
 
 
-def _print_fit(name: str, fit: EllipsoidFit) -> None:
+def _print_fit(name: str, fit: 'EllipsoidFit') -> None:
     if not fit.converged:
         print(f'{name}: calibration rejected: {fit.reason}')
     else:

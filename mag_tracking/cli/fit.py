@@ -4,6 +4,7 @@ import argparse
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, Pass
 from mag_tracking.apps.fit import PassFitter, check_cpa_range, check_orders
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli import options
-from mag_tracking.cli.tables import HEADER, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.inference.identification import Iron, hard_and_soft_iron
@@ -36,6 +36,8 @@ ORDERS = (1, 2, 3, 4)
 """Numbers of dipoles that are tried by default."""
 P_WARNING = 1e-3
 """False-alarm probability of the chi-square test for contradictory moments of one vehicle."""
+Estimate = tuple[float, float]
+"""Value and standard deviation; NaN if unknown."""
 
 _FIT_HELP = '''
 Extracts each pass from a recording (from shortly before a detection until the end of the
@@ -85,6 +87,32 @@ def add(commands: options.Commands) -> None:
                    help='YAML file with the settings to override')
     p.add_argument('--no-figures', action='store_true', help='do not draw figures')
     options.add_verbose(p)
+
+
+def time_of(stamp_ns: float) -> str:
+    """Format the time of day of a timestamp (UTC)."""
+    time = datetime.fromtimestamp(stamp_ns / NS, tz=UTC)
+    return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'
+
+
+def vehicle_row(label: str, time: str, kind: str, direction: str, speed: str | Estimate,
+                closest: str | Estimate, verdict: str) -> str:
+    """Format a row; `closest` is the distance from the centre of the sensors [m]."""
+    return (f'  {label:<9}  {time:<11}  {kind or "-":<9}  {direction or "-":<10}  '
+            f'{_text(speed):>14}  {_text(closest):>14}  {verdict or "-"}')
+
+
+def _text(estimate: str | Estimate) -> str:
+    """Format a value and its standard deviation, as far as they are known."""
+    if isinstance(estimate, str):
+        return estimate
+    value, std = estimate
+    return '-' if np.isnan(value) else f'{value:.2f}' if np.isnan(std) else \
+        f'{value:.2f} ± {std:.2f}'
+
+
+HEADER = vehicle_row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'closest [m]',
+                     'verdict')
 
 
 class Fits:

@@ -14,8 +14,7 @@ from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.network.sensor_network import TOPIC_NAME_PATTERN
-from mag_tracking.recording.reader import Recording
-from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, check_port
+from mag_tracking.web import DEFAULT_PORT, LOOPBACK
 
 _RUN_HELP = '''
 Starts the calibration, detection and tracker nodes in one process, the replay node with
@@ -85,8 +84,9 @@ def add(commands: options.Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    # Imported here because it needs ROS.
+    # Imported here, as in `_page_process`, because `record` does not need them.
     from mag_tracking.nodes.runner import run
+    from mag_tracking.recording.reader import Recording
 
     settings = options.settings_of(args, read_network(args.network))
     ros_arguments = list(args.ros_arguments)
@@ -105,6 +105,8 @@ def _run(args: argparse.Namespace) -> int:
 @contextmanager
 def _page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
     """Run the live page in a process that cannot delay the nodes; raises DeviceError."""
+    from mag_tracking.web.page_server import check_port
+
     check_port(host, port)
     # The page process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([

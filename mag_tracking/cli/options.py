@@ -12,8 +12,9 @@ from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.sensor_network import MAX_BOARD_EXTENT, checked_namespace
-from mag_tracking.settings import read_parameter_file
+from mag_tracking.settings import TARGETS, read_parameter_file
 from mag_tracking.stages.health.diagnosis import Diagnosis
+from mag_tracking.web import DEFAULT_PORT, LOOPBACK
 
 if TYPE_CHECKING:
     # Not every command loads the stages.
@@ -87,9 +88,6 @@ def add_verbose(parser: argparse.ArgumentParser) -> None:
 
 def add_page(parser: argparse._ActionsContainer, port: bool = True) -> None:
     """Add --host and --port, or only --host."""
-    # Not every command loads the server.
-    from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
-
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
                             help=f'port of the page (default: {DEFAULT_PORT}; 0 selects a free '
@@ -141,11 +139,9 @@ def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add --target and --params."""
-    from mag_tracking.pipeline import TARGET_DEFAULTS
-
     parser.add_argument('--params', type=Path, metavar='FILE',
                         help='YAML file with the settings to override')
-    parser.add_argument('--target', choices=list(TARGET_DEFAULTS),
+    parser.add_argument('--target', choices=TARGETS,
                         help='type of target: a vehicle, a magnet in a hand, or a magnet on a '
                         'bench (default: magnet for a board of sensors, otherwise vehicle)')
 

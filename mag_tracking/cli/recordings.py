@@ -4,20 +4,21 @@ import argparse
 import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from mag_tracking.apps.info import Source, Timing, time_topics
 from mag_tracking.cli import options
 from mag_tracking.errors import SettingsError
-from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.sensor_network import absolute, namespaces_of
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.repair import repair
 from mag_tracking.units import NS
+
+if TYPE_CHECKING:
+    from mag_tracking.apps.info import Source, Timing
+    from mag_tracking.recording.reader import Recording
 
 _IMPORT_HELP = '''
 Converts a table of text (CSV, TSV, lines of numbers) to a recording. Encoding, separator, decimal
@@ -77,6 +78,10 @@ def add(commands: options.Commands) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
+    # Imported here, as in the other functions, because other commands do not need them.
+    from mag_tracking.apps.info import time_topics
+    from mag_tracking.recording.reader import Recording
+
     recording = Recording(args.recording)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
               disable=None) as bar:
@@ -102,7 +107,7 @@ def _info(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_duration(recording: Recording, timings: Sequence[Timing]) -> None:
+def _print_duration(recording: 'Recording', timings: 'Sequence[Timing]') -> None:
     """Print the duration by the log times, or by the timestamps if they contradict each other."""
     wrong = next((timing for timing in timings if timing.clocks_disagree), None)
     if wrong is not None:
@@ -113,8 +118,10 @@ def _print_duration(recording: Recording, timings: Sequence[Timing]) -> None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
 
 
-def _print_sensors(network: SensorNetwork, recording: Recording,
-                   timings: Mapping[Source, Timing]) -> None:
+def _print_sensors(network: SensorNetwork, recording: 'Recording',
+                   timings: 'Mapping[Source, Timing]') -> None:
+    from mag_tracking.messages.types import MAGNETIC_FIELD
+
     namespaces = namespaces_of(network.topics, recording.types) or ['/']
     if len(namespaces) > 1:
         print(f'  namespaces with topics of the network: {", ".join(namespaces)}')
@@ -130,7 +137,6 @@ def _print_sensors(network: SensorNetwork, recording: Recording,
 
 
 def _import(args: argparse.Namespace) -> int:
-    # Imported here because other commands do not need them.
     from mag_tracking.recording.field_table import describe, import_field_table
     from mag_tracking.recording.pose_table import import_pose_table
 
@@ -161,6 +167,8 @@ def _time_text(stamp_ns: int) -> str:
 
 
 def _repair(args: argparse.Namespace) -> int:
+    from mag_tracking.recording.repair import repair
+
     n = repair(args.recording)
     print(f'{args.recording}: files repaired: {n}')
     return 0

@@ -18,8 +18,8 @@ from mag_tracking.apps.replay import Run, replay, write_figures, write_trajector
 from mag_tracking.apps.replay_report import notes_of, write_report
 from mag_tracking.apps.traffic import check_vehicles
 from mag_tracking.cli import options
-from mag_tracking.cli.fit import ORDERS, Fits
-from mag_tracking.cli.tables import HEADER, Events, Passages, time_of, vehicle_row
+from mag_tracking.cli.fit import HEADER, ORDERS, Fits, time_of, vehicle_row
+from mag_tracking.cli.tables import Events, Passages
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
 from mag_tracking.geometry import speed_of

@@ -1,16 +1,16 @@
-"""Tables `passages` and `events` of `mag-tracking replay`, and the rows of vehicles."""
+"""Tables `passages` and `events` of `mag-tracking replay`."""
 
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mag_tracking.apps import traffic
+from mag_tracking.cli.fit import time_of
 from mag_tracking.cli.options import check_writable
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import PassEvent
@@ -22,35 +22,6 @@ from mag_tracking.results import columns, traffic_tables
 from mag_tracking.run import RunReport
 from mag_tracking.stages.events.stage import MAX_DURATION_S
 from mag_tracking.units import NS
-
-Estimate = tuple[float, float]
-"""Value and standard deviation; NaN if unknown."""
-
-
-def time_of(stamp_ns: float) -> str:
-    """Format the time of day of a timestamp (UTC)."""
-    time = datetime.fromtimestamp(stamp_ns / NS, tz=UTC)
-    return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'
-
-
-def vehicle_row(label: str, time: str, kind: str, direction: str, speed: str | Estimate,
-                closest: str | Estimate, verdict: str) -> str:
-    """Format a row; `closest` is the distance from the centre of the sensors [m]."""
-    return (f'  {label:<9}  {time:<11}  {kind or "-":<9}  {direction or "-":<10}  '
-            f'{_text(speed):>14}  {_text(closest):>14}  {verdict or "-"}')
-
-
-def _text(estimate: str | Estimate) -> str:
-    """Format a value and its standard deviation, as far as they are known."""
-    if isinstance(estimate, str):
-        return estimate
-    value, std = estimate
-    return '-' if np.isnan(value) else f'{value:.2f}' if np.isnan(std) else \
-        f'{value:.2f} ± {std:.2f}'
-
-
-HEADER = vehicle_row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'closest [m]',
-                     'verdict')
 
 
 class Events:

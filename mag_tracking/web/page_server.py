@@ -20,13 +20,12 @@ from websockets.http11 import Request, Response
 from mag_tracking.errors import DeviceError
 from mag_tracking.files import json_text
 from mag_tracking.report.page import live_html
+from mag_tracking.web import DEFAULT_PORT, LOOPBACK
 
 if TYPE_CHECKING:
     # Loads scipy.
     from mag_tracking.web.live_scene import LiveScene
 
-LOOPBACK = '127.0.0.1'
-DEFAULT_PORT = 8765
 UPDATE_INTERVAL_S = 0.05
 """[s] Interval between messages. A target at 50 km/h moves 0.7 m in this time."""
 MAX_BUFFERED = 1_000_000

@@ -143,9 +143,9 @@ def test_a_closed_pipe_ends_the_command_silently(unbuffered):
 
 
 def test_a_broken_pipe_elsewhere_is_an_error(monkeypatch, capfd):
-    def broken(path):
+    def broken(*arguments):
         raise BrokenPipeError(errno.EPIPE, 'the sensor')
 
-    monkeypatch.setattr('mag_tracking.cli.recordings.Recording', broken)
+    monkeypatch.setattr('mag_tracking.apps.info.time_topics', broken)
     assert main(['info', str(vehicle_path(NAME))]) == 1
     assert 'the sensor' in capfd.readouterr().err

@@ -26,7 +26,10 @@ print(json.dumps(sorted(sys.modules)))
 @pytest.mark.parametrize('args, excluded', [
     (['--help'], ('numpy',)), (['--version'], ('numpy',)), (['info', '--help'], ()),
     (['info', RECORDING], ()), (['info', RECORDING, '--network', str(NETWORK_FILE)], ()),
-    (['ros', 'topics', '--help'], ())])
+    (['ros', 'topics', '--help'], ()),
+    (['import', '--help'], ('mcap', 'mag_tracking.apps', 'mag_tracking.recording')),
+    (['record', '--help'], ('websockets', 'mag_tracking.pipeline', 'mag_tracking.recording')),
+    (['calibrate', 'tumble', '--help'], ('mag_tracking.calibration', 'mag_tracking.pipeline'))])
 def test_a_command_imports_only_what_it_needs(args, excluded):
     done = subprocess.run([sys.executable, '-c', IMPORT_SCRIPT, *args], capture_output=True,
                           text=True, check=True)
