@@ -18,7 +18,7 @@ MAX_FILE_LINES, MAX_FUNCTION_LINES = 350, 40
 BUDGETS = {
     'cli': 2750, 'nodes': 3590, 'apps': 5150, 'web': 540, 'report': 890, 'results': 1380,
     'drivers': 4700, 'recording': 4270, 'stages': 9880, 'messages': 1490, 'simulation': 120,
-    'analysis': 2730, 'calibration': 5260, 'network': 730, 'physics': 1850, 'inference': 2780,
+    'analysis': 2730, 'calibration': 5270, 'network': 730, 'physics': 1850, 'inference': 2780,
     'modules': 2500}
 """Maximum lines of each package, and of the modules outside packages, in Python and C++ with
 docstrings. A change may lower a budget; one that raises it says why."""
