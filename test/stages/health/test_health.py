@@ -77,8 +77,9 @@ def faulty(fault):
         stamps[1500:] -= 5 * NS
     elif fault == 'step':
         stamps[1500:] += NS
-    elif fault == 'late':
+    elif fault in ('late', 'zone, slow computer'):
         received = received + (np.random.default_rng(2).random(3000) * 0.12 * NS).astype(np.int64)
+        received += 7200 * NS * (fault != 'late')
     elif fault == 'ahead':
         stamps = stamps + 3 * NS
     elif fault == 'stuck':
@@ -107,6 +108,7 @@ def faulty(fault):
     ('back', True, 'back once'),
     ('step', True, 'clock stepped'),
     ('late', False, 'ms to arrive'),
+    ('zone, slow computer', False, 'is 7200.1 s'),
     ('ahead', False, '-3.0 s'),
     ('stuck', True, 'are identical'),
     ('saturated', True, 'the range'),
