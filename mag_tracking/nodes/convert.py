@@ -123,7 +123,7 @@ def _check_finite(subject: str, **arrays: FloatArray) -> None:
 
 def smoothed_path_of(message: Any) -> FloatArray:
     """Positions (n, 3) of a mag_tracking_msgs/SmoothedTrack, m, world frame; raises RecordingError
-    if there is none, array lengths differ, or one is not finite."""
+    if it has no position, array lengths differ, or a value is not finite."""
     lengths = {name: len(getattr(message, name)) for name in (
         'poses', 'velocities', 'pose_ambiguous')}
     n = lengths['poses']

@@ -124,7 +124,7 @@ def definitions_of(data: bytes, places: Iterable[tuple[int, int, int]]
 
 
 def _footer(stream: BinaryIO) -> tuple[int, int] | None:
-    """Return the offset of the summary (0 if there is none) and its CRC (0 if unknown); None if the
+    """Return the offset of the summary (0 without one) and its CRC (0 if unknown); None if the
     file is incomplete: it does not end with a footer."""
     size = file_size(stream)
     if size < len(MAGIC) + _FOOTER.size:

@@ -42,7 +42,7 @@ _ENTRIES: dict[str, _Entry] = {
     'temperature': _NUMBER, 'limit': _NUMBER, 'method': _TEXT, 'unit': _TEXT, 'classes': _NAMES,
     'axes': _NAMES, 'examples': ('a mapping from classes to numbers', lambda v: isinstance(
         v, dict) and all(isinstance(n, int) for n in v.values()), dict)}
-"""What is expected of an entry of a model file that is no array, test and conversion."""
+"""Entries of a model file, except arrays: (expected value, its test, its conversion)."""
 _AXIS_COLUMN = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
 _SAMPLE_COLUMN = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
 

@@ -346,7 +346,7 @@ class XsensFraming:
     @staticmethod
     def _next_start(window: bytes, index: int, end: int, complete: bool) -> int:
         """Index of the next message start from `index` on, of which both bytes (if `complete`) or
-        the first are before `end`; -1 if there is none."""
+        the first are before `end`; -1 without such a start."""
         found = window.find(_START, index, end if complete else end + 1)
         if found < 0 and not complete and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1
